@@ -19,6 +19,7 @@ from morphgen.encoding.tokens import GEOMETRY, SHAPE_POSE
 from morphgen.errors import TaskError
 from morphgen.model.kinematics_torch import (
     FrameChain,
+    KinematicTree,
     compile_tree,
     dls_step,
     forward_kinematics,
@@ -100,17 +101,12 @@ class IkSolutions:
         moved = torch.linalg.vector_norm(points - self._solved_for, dim=1) > MOVED
         exists = goals.exists[:, 0]
         self.q = torch.where(exists[:, None], self.q, targets)
-        rows = torch.nonzero(moved & exists)[:, 0]
-        if not len(rows):
-            return
-        self._solved_for[rows] = points[rows]
-        if goals.rotations is None or goals.has_rotation is None:
-            self._solve(rows, targets, points, None, metres_per_radian)
-            return
-        posed = goals.has_rotation[rows]
-        for some, rotations in ((rows[~posed], None), (rows[posed], goals.rotations)):
-            if len(some):
-                self._solve(some, targets, points, rotations, metres_per_radian)
+        posed = torch.zeros_like(exists) if goals.has_rotation is None else goals.has_rotation
+        for mask, rotations in ((~posed, None), (posed, goals.rotations)):
+            rows = torch.nonzero(moved & exists & mask)[:, 0]
+            if len(rows):
+                self._solved_for[rows] = points[rows]
+                self._solve(rows, targets, points, rotations, metres_per_radian)
 
     def _solve(
         self,
@@ -177,14 +173,18 @@ DAMPING = 0.03
 class _State:
     """Quantities that several channels are computed from; n environments, J joints."""
 
+    tree: KinematicTree
     chain: FrameChain  # chains of the tools
     robot_index: torch.Tensor
     q: torch.Tensor
     targets: torch.Tensor
-    T_root_link: torch.Tensor | None
-    """Poses of the links, shape (n, L, 4, 4), if a channel needs them."""
     goals: ToolTargets
     block_pose: torch.Tensor
+
+    @cached_property
+    def T_root_link(self) -> torch.Tensor:
+        """Poses of the links, shape (n, L, 4, 4)."""
+        return forward_kinematics(self.tree, self.robot_index, self.q)
 
     @cached_property
     def tool(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -253,18 +253,11 @@ class KinematicChannels:
         self._effort = tables.effort[index].clamp(min=NEAR).log() / 5  # 150 N m become one
         self._is_prismatic = tables.is_prismatic[index].float()
         self._solutions = IkSolutions(tables, index, space_of) if "ik" in names else None
-        needs_links = "poses" in names or ("jacobian" in names and self._has_block is not None)
-        self._tree = (
-            compile_tree(tables.robots, max_links=tables.max_links, device=tables.device)
-            if needs_links
-            else None
-        )
-        if self._tree is not None:
-            self._R_joint_canonical = rotation_from_z(self._tree.joints.axis)[index]
-            self._ancestors = tables.ancestors[index]
-            tokens = tables.tokens[index]
-            self._half_extents = _half_extents(tokens[..., GEOMETRY.columns])
-            self._shape_pose = tokens[..., SHAPE_POSE.columns]
+        self._tree = compile_tree(tables.robots, max_links=tables.max_links, device=tables.device)
+        self._R_joint_canonical = rotation_from_z(self._tree.joints.axis)[index]
+        self._ancestors, tokens = tables.ancestors[index], tables.tokens[index]
+        self._half_extents = _half_extents(tokens[..., GEOMETRY.columns])
+        self._shape_pose = tokens[..., SHAPE_POSE.columns]
 
     def begin(self, mask: torch.Tensor) -> None:
         """Note that episodes begin in some environments, shape (n,), bool."""
@@ -275,16 +268,8 @@ class KinematicChannels:
         self, q: torch.Tensor, targets: torch.Tensor, goals: ToolTargets, block_pose: torch.Tensor
     ) -> dict[str, torch.Tensor]:
         """Return the channels by name, at joint positions (n, J) and block poses (n, 7)."""
-        index, tree = self._index, self._tree
-        state = _State(
-            chain=self._tables.tool_chain,
-            robot_index=index,
-            q=q,
-            targets=targets,
-            T_root_link=None if tree is None else forward_kinematics(tree, index, q),
-            goals=goals,
-            block_pose=block_pose,
-        )
+        chain = self._tables.tool_chain
+        state = _State(self._tree, chain, self._index, q, targets, goals, block_pose)
         channels = {
             "lag": self._lag,
             "joint": self._joint_state,
@@ -317,10 +302,8 @@ class KinematicChannels:
         return self._at_links(torch.stack(columns, dim=-1))
 
     def _poses(self, state: _State) -> torch.Tensor:
-        T_root_link = state.T_root_link
-        assert T_root_link is not None
-        R_root_joint = T_root_link[..., :3, :3] @ self._R_joint_canonical
-        origins = T_root_link[..., :3, 3]
+        R_root_joint = state.T_root_link[..., :3, :3] @ self._R_joint_canonical
+        origins = state.T_root_link[..., :3, 3]
         to_tool = state.tool[0][:, None, :3, 3] - origins
         to_points = (state.goals.points[:, None] - origins[:, :, None]).flatten(2)
         vectors = POSITION_SCALE * torch.cat([origins, to_tool, to_points], dim=-1)
@@ -341,7 +324,9 @@ class KinematicChannels:
             columns.append(self._at_joints(POSITION_SCALE * error))
             columns += [self._products(linear, error), self._products(linear, later_error)]
         if goals.rotations is not None:
-            error = _rotation_error(goals, T_root_tool)
+            assert goals.has_rotation is not None
+            error = rotvec_from_matrix(goals.rotations @ T_root_tool[:, :3, :3].transpose(1, 2))
+            error = error * goals.has_rotation[:, None]
             columns += [self._at_joints(error), self._products(angular, error)]
         if self._has_block is not None:
             point, J_root_point = self._nearest_point(state)
@@ -413,9 +398,7 @@ class KinematicChannels:
         Links are bounded by the boxes around their collision shapes' primitives. Mimic joints do
         not count as parts of their leaders.
         """
-        T_root_link, tree = state.T_root_link, self._tree
-        assert T_root_link is not None
-        assert tree is not None
+        T_root_link = state.T_root_link
         rows = torch.arange(len(state.q), device=state.q.device)
         R_root_shape = T_root_link[..., :3, :3] @ matrix_from_quaternion(self._shape_pose[..., 3:])
         centres = T_root_link[..., :3, 3] + (
@@ -430,14 +413,12 @@ class KinematicChannels:
         link = torch.where(has_shape, distance, torch.inf).argmin(dim=1)
         point = points[rows, link]
 
-        origins, axes = joint_axes(tree, self._index, T_root_link)
-        link_of_joint = self._link_of_joint
-        at_joint = rows[:, None], link_of_joint
-        lever = point[:, None] - origins[at_joint]
-        axis = axes[at_joint]
+        origins, axes = joint_axes(self._tree, self._index, T_root_link)
+        at_joint = rows[:, None], self._link_of_joint
+        axis, lever = axes[at_joint], point[:, None] - origins[at_joint]
         prismatic = self._is_prismatic[..., None] > 0
         columns = torch.where(prismatic, axis, torch.linalg.cross(axis, lever))
-        moves = torch.gather(self._ancestors[rows, link], 1, link_of_joint)
+        moves = torch.gather(self._ancestors[rows, link], 1, self._link_of_joint)
         return point, (columns * moves[..., None]).transpose(1, 2)
 
     def _at_joints(self, vectors: torch.Tensor) -> torch.Tensor:
@@ -448,14 +429,6 @@ class KinematicChannels:
         """Return values of joints (n, J, k) at the links that they move, shape (n, L, k)."""
         index = self._joint.clamp(min=0)[..., None].expand(-1, -1, values.shape[-1])
         return torch.gather(values, 1, index) * (self._joint >= 0)[..., None]
-
-
-def _rotation_error(goals: ToolTargets, T_root_tool: torch.Tensor) -> torch.Tensor:
-    """Return rotation vectors from the tool to its goal, shape (n, 3) [rad]; zeros without one."""
-    assert goals.rotations is not None
-    assert goals.has_rotation is not None
-    R_error = goals.rotations @ T_root_tool[:, :3, :3].transpose(1, 2)
-    return rotvec_from_matrix(R_error) * goals.has_rotation[:, None]
 
 
 def _half_extents(geometry: torch.Tensor) -> torch.Tensor:

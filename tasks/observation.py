@@ -178,16 +178,17 @@ def box_tokens(pose: torch.Tensor, size: torch.Tensor) -> torch.Tensor:
 
 
 def obstacle_tokens(scenes: Sequence[Scene], min_rows: int, device: torch.device) -> Observation:
-    """Return tokens of the obstacles in scenes, (n, O, 13), and the mask of real ones, (n, O)."""
+    """Return tokens of the obstacles in scenes, (n, O, 13), and the mask of real ones, (n, O).
+
+    The poses are zeros.
+    """
     num_rows = max(min_rows, *(len(scene.obstacles) for scene in scenes))
-    pose, size = torch.zeros(len(scenes), num_rows, 7), torch.zeros(len(scenes), num_rows, 3)
-    mask = torch.zeros(len(scenes), num_rows, dtype=torch.bool)
+    size = torch.zeros(len(scenes), num_rows, 3)
     for i, scene in enumerate(scenes):
         for k, block in enumerate(scene.obstacles):
-            pose[i, k] = torch.tensor([*block.pose.position, *block.pose.quaternion])
             size[i, k] = torch.tensor(block.size)
-            mask[i, k] = True
-    tokens = box_tokens(pose, size) * mask[..., None]
+    mask = size[..., 0] > 0
+    tokens = box_tokens(size.new_zeros(*mask.shape, 7), size) * mask[..., None]
     return {"obstacles": tokens.to(device), "obstacle_mask": mask.to(device)}
 
 

@@ -31,7 +31,7 @@ GAP = 0.05
 
 
 class PushFormulas(StepFormulas[A]):
-    """Compares blocks with lines, y (k,) [m]; the tokens (k, 13) are those of the blocks."""
+    """Compares blocks with lines, y (k,) [m], which they must cross; blocks have tokens (k, 13)."""
 
     def __init__(self, config: PushConfig, line: A, tokens: A) -> None:
         self._config = config
@@ -39,8 +39,18 @@ class PushFormulas(StepFormulas[A]):
         self._shape: A = tokens[..., 7:]
 
     def evaluate(self, state: TaskState[A]) -> StepResult[A]:
-        """Compare the blocks with their lines; see ``evaluate_push``."""
-        return evaluate_push(self._config, self._line, state)
+        """Compare the blocks with their lines."""
+        y, config = state.block_pose[..., 1], self._config
+        to_go = positive_part(self._line - y)
+        success = (y > self._line) & ~state.diverged
+        approach = row_norms(state.tool - state.block_pose[..., :3])
+        return StepResult(
+            success=success,
+            terminated=success & ~state.diverged,
+            distance=to_go,
+            score=choose(success, 1.0),
+            terms=push_terms(config, to_go, approach, state.limit_violation, success),
+        )
 
     def observe(self, block_pose: A) -> dict[str, A]:
         """Return the blocks and their lines."""
@@ -129,21 +139,6 @@ class PushEnvs(TaskEnvs):
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
         """Restore the position of the line."""
         self.line.copy_(state["line"])
-
-
-def evaluate_push(config: PushConfig, line: A, state: TaskState[A]) -> StepResult[A]:
-    """Compare blocks with the lines, y (k,) [m], that they must cross."""
-    y = state.block_pose[..., 1]
-    to_go = positive_part(line - y)
-    success = (y > line) & ~state.diverged
-    approach = row_norms(state.tool - state.block_pose[..., :3])
-    return StepResult(
-        success=success,
-        terminated=success & ~state.diverged,
-        distance=to_go,
-        score=choose(success, 1.0),
-        terms=push_terms(config, to_go, approach, state.limit_violation, success),
-    )
 
 
 def push_terms(

@@ -446,24 +446,24 @@ def draw_starts(space: FreeSpace, blocks: Array, seeds: np.random.SeedSequence) 
     return np.array(starts)
 
 
-def misplaced_blocks(pushes: PushStartSet, space: FreeSpace) -> Iterator[str]:
-    """Yield a fault for each start whose block is not where a push may begin."""
-    edge = pushes.block.size[2]
-    above = pushes.blocks[:, 2] - edge / 2 - pushes.ground
+def start_faults(pushes: PushStartSet, space: FreeSpace) -> Iterator[str]:
+    """Yield the faults of each start: of its block, its configurations and their tools."""
+    x, y, z = pushes.blocks[:, :3].T
+    above = z - pushes.block.size[2] / 2 - pushes.ground
     for i in np.flatnonzero(np.abs(above) > RESTS).tolist():
         yield f"start {i}: the block is {above[i]:.2g} m above the ground"
-    for i in np.flatnonzero(pushes.blocks[:, 1] >= pushes.line).tolist():
-        yield f"start {i}: the block is across the line already"
-    for i in np.flatnonzero(~space.block_is_clear(pushes.blocks)).tolist():
-        yield f"start {i}: the block is in the base"
-
-
-def misplaced_tools(pushes: PushStartSet, robot: Robot) -> Iterator[str]:
-    """Yield a fault for each certificate whose tool is not behind its block or at the line."""
-    tool = MujocoKinematics(robot)
-    behind, across = (tool.frame_pose(q)[:, :3, 3] for q in (pushes.behind, pushes.across))
-    for i, (back, front, block) in enumerate(zip(behind, across, pushes.blocks, strict=True)):
-        if abs(back[0] - block[0]) > CLOSE or back[1] >= block[1]:
-            yield f"start {i}: the tool of its proof is not behind the block"
-        if abs(front[0] - block[0]) > CLOSE or abs(front[1] - pushes.line) > CLOSE:
-            yield f"start {i}: the tool of its proof is not on the line"
+    behind, across = pushes.behind, pushes.across
+    tool = MujocoKinematics(space.scene.robot)
+    back, front = (tool.frame_pose(q)[:, :3, 3].T for q in (behind, across))
+    is_behind = (np.abs(back[0] - x) <= CLOSE) & (back[1] < y)
+    is_across = (np.abs(front[0] - x) <= CLOSE) & (np.abs(front[1] - pushes.line) <= CLOSE)
+    for fault, is_sound in (
+        ("the block is across the line already", y < pushes.line),
+        ("the block is in the base", space.block_is_clear(pushes.blocks)),
+        ("start is in collision", space.free(pushes.q, pushes.blocks)),
+        ("proof behind is in collision", space.free(behind, pushes.blocks)),
+        ("proof across is in collision", space.free(across)),
+        ("the tool of its proof is not behind the block", is_behind),
+        ("the tool of its proof is not on the line", is_across),
+    ):
+        yield from (f"start {i}: {fault}" for i in np.flatnonzero(~is_sound).tolist())

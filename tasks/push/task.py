@@ -19,9 +19,8 @@ from morphgen.tasks.push.starts import (
     draw_feasible,
     draw_starts,
     feasible_starts,
-    misplaced_blocks,
-    misplaced_tools,
     push_region,
+    start_faults,
 )
 from morphgen.tasks.scenes.obstacles import layout_faults, no_obstacles, with_obstacles
 from morphgen.tasks.sim.base import Block, Scene
@@ -135,11 +134,7 @@ class Push(Task[PushConfig, PushStartSet]):
         for name, q in configurations.items():
             faults += [f"start {i}: {name}: {reason}" for i, reason in outside_limits(robot, q)]
         space = FreeSpace(replace(scene, robot=robot, block=goals.block, obstacles=()))
-        faults += misplaced_blocks(goals, space)
-        for name, q in configurations.items():
-            free = space.free(q, None if q is goals.across else goals.blocks)
-            faults += [f"start {i}: {name} is in collision" for i in np.flatnonzero(~free).tolist()]
-        return [*faults, *misplaced_tools(goals, robot)]
+        return [*faults, *start_faults(goals, space)]
 
     def scene(self, robot: Robot, goals: PushStartSet, ground: float) -> Scene:
         """Return the scene with the block."""

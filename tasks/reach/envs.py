@@ -36,12 +36,20 @@ class ReachFormulas(StepFormulas[A]):
         self._goal_rotation: A | None = goal_rotation
 
     def evaluate(self, state: TaskState[A]) -> StepResult[A]:
-        """Compare the tools with their goals; see ``evaluate_reach``."""
-        angle = None
+        """Compare the tools with their goals."""
+        angle, config = None, self._config
         tool, goal = state.tool_rotation, self._goal_rotation
         if isinstance(tool, torch.Tensor) and isinstance(goal, torch.Tensor):
             angle = angle_between(tool, goal)  # such goals are evaluated in torch alone
-        return evaluate_reach(self._config, self._goal, state, angle)
+        distance = row_norms(state.tool - self._goal[..., :3])
+        return StepResult(
+            success=is_near(config, distance, angle) & ~state.diverged,
+            terminated=state.diverged & ~state.diverged,  # never: an episode lasts until its limit
+            distance=distance,
+            score=anybody_score(config, distance, angle),
+            terms=reach_terms(config, distance, state.limit_violation, state.acceleration, angle),
+            angle=angle,
+        )
 
     def observe(self, block_pose: A) -> dict[str, A]:
         """Return the goals."""
@@ -158,21 +166,6 @@ def _reachable_configuration(
     arrived = np.flatnonzero(error < _ARRIVED)
     free = arrived[space.free(q[arrived])]
     return q[free[0]] if len(free) else None
-
-
-def evaluate_reach(
-    config: ReachConfig, goal: A, state: TaskState[A], angle: A | None = None
-) -> StepResult[A]:
-    """Compare tools with goal poses (k, 7); the angles between are None for goals of positions."""
-    distance = row_norms(state.tool - goal[..., :3])
-    return StepResult(
-        success=is_near(config, distance, angle) & ~state.diverged,
-        terminated=state.diverged & ~state.diverged,  # never: an episode lasts until its limit
-        distance=distance,
-        score=anybody_score(config, distance, angle),
-        terms=reach_terms(config, distance, state.limit_violation, state.acceleration, angle),
-        angle=angle,
-    )
 
 
 def is_near(config: ReachConfig, distance: A, angle: A | None = None) -> A:

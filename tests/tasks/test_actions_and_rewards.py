@@ -21,9 +21,9 @@ from morphgen.tasks.actions import ActionDecoder, JointMotion
 from morphgen.tasks.gym.vector import task_vector
 from morphgen.tasks.observation import LinkTokens
 from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.push.envs import curriculum_line, evaluate_push, push_terms
+from morphgen.tasks.push.envs import PushFormulas, curriculum_line, push_terms
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.reach.envs import anybody_score, evaluate_reach, is_near, reach_terms
+from morphgen.tasks.reach.envs import ReachFormulas, anybody_score, is_near, reach_terms
 from morphgen.tasks.rows import limit_violation, numpy_row, positive_part
 from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.scenes.robot_tables import STEP_SLIDE, STEP_TURN, build_robot_tables
@@ -120,9 +120,10 @@ def test_a_diverged_step_is_never_a_success():
     """Even with the tool at the goal and the block across the line."""
     tool, block, zero = torch.zeros(2, 3), torch.zeros(2, 7), torch.zeros(2)
     state = TaskState(tool, block, zero, zero, diverged=torch.tensor([False, True]))
-    reached = evaluate_reach(ReachConfig(), torch.zeros(2, 7), state)
+    reached = ReachFormulas(ReachConfig(), torch.zeros(2, 7), None).evaluate(state)
     assert reached.success.tolist() == [True, False]
-    pushed = evaluate_push(PushConfig(), torch.tensor([-0.1, -0.1]), state)
+    lines = torch.tensor([-0.1, -0.1])
+    pushed = PushFormulas(PushConfig(), lines, torch.zeros(2, 13)).evaluate(state)
     assert pushed.success.tolist() == pushed.terminated.tolist() == [True, False]
     assert pushed.score.tolist() == [1.0, 0.0]
 
