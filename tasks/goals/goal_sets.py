@@ -10,7 +10,7 @@ import io
 import json
 import lzma
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import cache
 from os import PathLike
@@ -96,25 +96,28 @@ def goal_set(
             )
         return shipped
 
-    def sample() -> GoalSet:
-        digest = int(robot_hash(robot, visuals=False), 16)
-        seeds = np.random.SeedSequence([seed, digest, int(obstacles)])
-        identity = {"robot": robot.name, "key": key, "seed": seed}
-        goals = task.sample(
-            robot, config, obstacles=obstacles, ground=ground, seeds=seeds, identity=identity
-        )
-        kind = task.goal_set_type
-        require_returned(task.name, "sample", goals, isinstance(goals, kind), kind.__name__)
-        sampled: GoalSet = goals
-        return sampled
-
-    if anew:
-        return sample()
     kind: type[GoalSet] = task.goal_set_type
-    if (content := packaged_set(key)) is not None:
-        return replace(set_from_npz(content, kind), robot=robot.name)
     folder = user_cache_path("morphgen") / task.cache_folder if cache is None else Path(cache)
-    return _cached(kind, folder / f"{key}.npz", robot.name, sample)
+    path = folder / f"{key}.npz"
+    if not anew:
+        if (content := packaged_set(key)) is not None:
+            return replace(set_from_npz(content, kind), robot=robot.name)
+        if path.is_file():
+            return replace(_read_cached(path, kind), robot=robot.name)
+    seeds = np.random.SeedSequence(
+        [seed, int(robot_hash(robot, visuals=False), 16), int(obstacles)]
+    )
+    identity = {"robot": robot.name, "key": key, "seed": seed}
+    goals: GoalSet = task.sample(
+        robot, config, obstacles=obstacles, ground=ground, seeds=seeds, identity=identity
+    )
+    require_returned(task.name, "sample", goals, isinstance(goals, kind), kind.__name__)
+    try:
+        if not anew:
+            write_cache_file(path, set_npz(goals))
+    except OSError as error:
+        warnings.warn(f"cannot store a {kind.__name__} in {path}: {error.strerror}", stacklevel=2)
+    return goals
 
 
 def goal_set_key(
@@ -178,25 +181,15 @@ def goals_from_npz(content: bytes, task: str, path: Path) -> GoalSet:
     return goals
 
 
-def _cached(kind: type[G], path: Path, robot: str, sample: Callable[[], G]) -> G:
-    """Return a goal set from the cache, or sample and store it.
-
-    Warns if it cannot be stored. The name of the file is the set's key.
-    """
-    if path.is_file():
-        try:
-            cached = set_from_npz(path.read_bytes(), kind)
-        except (OSError, ValueError) as error:
-            raise TaskError(f"{path}: not a {kind.__name__}: {error}; delete it") from error
-        if cached.key != path.stem:
-            raise TaskError(f"{path}: its key is {cached.key}, not its name; delete it")
-        return replace(cached, robot=robot)
-    goals = sample()
+def _read_cached(path: Path, kind: type[G]) -> G:
+    """Return a goal set from the cache; the name of its file is the set's key."""
     try:
-        write_cache_file(path, set_npz(goals))
-    except OSError as error:
-        warnings.warn(f"cannot store a {kind.__name__} in {path}: {error.strerror}", stacklevel=3)
-    return goals
+        cached = set_from_npz(path.read_bytes(), kind)
+    except (OSError, ValueError) as error:
+        raise TaskError(f"{path}: not a {kind.__name__}: {error}; delete it") from error
+    if cached.key != path.stem:
+        raise TaskError(f"{path}: its key is {cached.key}, not its name; delete it")
+    return cached
 
 
 def _array(value: object) -> NDArray[Any]:
