@@ -38,7 +38,7 @@ from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.grammar_file import SUFFIX, Grammar, find_grammar, load_grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.request import default_name, parse_words
-from morphgen.grammar.robot_source import RobotSource, light_derivation, read_source
+from morphgen.grammar.robot_source import RobotReference, light_derivation, read_source
 from morphgen.model.robot import Robot
 from morphgen.splits.split import SIDES, Member, Side, Split, compose_member
 from morphgen.splits.split_file import find_split, read_split_file, split_names
@@ -144,7 +144,7 @@ def read_robot_uri(uri: str, files: FileAccess) -> Robot:
         path = files.path(uri)
         if uri.startswith(UPLOAD) and path.is_file():
             _require_readable_upload(uri, path, files)
-        return read_source(RobotSource(uri, path), files.library)
+        return read_source(RobotReference(uri, path), files.library)
     except RecursionError:
         raise UriError(f"{shorten(uri)}: is nested too deeply") from None
 

@@ -19,7 +19,7 @@ from morphgen.formats.urdf.read import UnsoundError
 from morphgen.grammar.library import Library, LibraryFolders, default_library
 from morphgen.grammar.robot_source import (
     RobotLike,
-    RobotSource,
+    RobotReference,
     find_robot,
     read_source,
     resolve_robot,
@@ -74,7 +74,11 @@ def fix(robot: RobotLike, *, library: LibraryFolders = ()) -> tuple[Robot, tuple
 
 
 def check_source(
-    source: RobotSource, library: Library, root: Path | None = None, *, tool_required: bool = True
+    source: RobotReference,
+    library: Library,
+    root: Path | None = None,
+    *,
+    tool_required: bool = True,
 ) -> tuple[Finding, ...]:
     """Find faults of a robot, also those of an unsound file, and of a bundle's files.
 
@@ -91,7 +95,7 @@ def check_source(
     return (*findings, *file_findings(folder)) if folder is not None else findings
 
 
-def bundle_of(source: RobotSource) -> Path | None:
+def bundle_of(source: RobotReference) -> Path | None:
     """Return the folder of a source's bundle, of which it may be a file; None if it has none."""
     if source.path is None:
         return None
@@ -143,7 +147,7 @@ def conform(
 
 
 def conform_source(
-    source: RobotSource,
+    source: RobotReference,
     library: Library,
     root: Path | None = None,
     *,

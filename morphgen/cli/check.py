@@ -18,7 +18,7 @@ from morphgen.errors import FormatError, one_line
 from morphgen.formats.bundle import bundle_folder, write_bundle
 from morphgen.formats.urdf.read import UnsoundError
 from morphgen.grammar.library import Library
-from morphgen.grammar.robot_source import RobotSource, read_source
+from morphgen.grammar.robot_source import RobotReference, read_source
 from morphgen.model.findings import Finding
 
 SEVERITIES = ("error", "warning", "info")
@@ -50,7 +50,7 @@ def check(args: argparse.Namespace) -> int:
 
 
 def _findings(
-    source: RobotSource, library: Library, args: argparse.Namespace, written: dict[Path, str]
+    source: RobotReference, library: Library, args: argparse.Namespace, written: dict[Path, str]
 ) -> tuple[Sequence[Finding], Sequence[Finding]]:
     """Return a robot's findings, and those that its repair into ``--fix`` removed."""
     if args.fix is None:

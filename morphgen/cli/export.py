@@ -39,7 +39,7 @@ from morphgen.formats.srdf import CUROBO_CONFIG, curobo_text, require_tool
 from morphgen.formats.urdf.write import MeshUri, urdf_text
 from morphgen.formats.usd import convert_urdf
 from morphgen.grammar.library import Library
-from morphgen.grammar.robot_source import RobotSource, read_source
+from morphgen.grammar.robot_source import RobotReference, read_source
 from morphgen.model.robot import Robot
 
 
@@ -50,7 +50,7 @@ def export(args: argparse.Namespace) -> int:
         raise FormatError(f"--out {args.out}: {problem}")
     paths: list[Path] = []
 
-    def write(source: RobotSource, library: Library) -> None:
+    def write(source: RobotReference, library: Library) -> None:
         robot = read_source(source, library, args.root)
         path = _target(source, robot, args)
         if path in paths:
@@ -69,7 +69,7 @@ def export(args: argparse.Namespace) -> int:
     return 2 if refused else 0
 
 
-def _target(source: RobotSource, robot: Robot, args: argparse.Namespace) -> Path:
+def _target(source: RobotReference, robot: Robot, args: argparse.Namespace) -> Path:
     """Return the path of a robot's file or folder."""
     path = bundle_folder(args.out or Path(), robot.name)
     if args.format == "ros2":

@@ -22,7 +22,7 @@ from morphgen.fitting.quality import Quality
 from morphgen.fitting.robot_fit import FitReport, parts_with_meshes, store_parts
 from morphgen.formats.bundle import bundle_folder, require_replaceable, write_bundle
 from morphgen.grammar.part import load_part
-from morphgen.grammar.robot_source import RobotSource, is_robot_file
+from morphgen.grammar.robot_source import RobotReference, is_robot_file
 from morphgen.model.geometry import MESH_SUFFIXES, Mesh, Shape
 from morphgen.model.robot import Robot
 
@@ -45,7 +45,7 @@ COLUMNS = {
 """Headers of the table of fits, and how their numbers are written."""
 
 
-Target: TypeAlias = tuple[RobotSource | None, Robot]
+Target: TypeAlias = tuple[RobotReference | None, Robot]
 """A robot to which primitives are fitted, and where it is from; None for a part alone."""
 
 
@@ -119,7 +119,7 @@ def _targets(args: argparse.Namespace) -> list[Target]:
 
 
 def _folder(
-    args: argparse.Namespace, source: RobotSource | None, robot: Robot, *, several: bool
+    args: argparse.Namespace, source: RobotReference | None, robot: Robot, *, several: bool
 ) -> Path:
     """Return the folder of the bundle."""
     parent, name = (args.out, robot.name) if several else (args.out.parent, args.out.name)

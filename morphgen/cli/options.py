@@ -18,7 +18,7 @@ from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.task import TaskConfig
 
 if TYPE_CHECKING:  # it loads packages for meshes, which take seconds
-    from morphgen.grammar.robot_source import RobotSource
+    from morphgen.grammar.robot_source import RobotReference
 
 T = TypeVar("T")
 
@@ -72,7 +72,7 @@ def library_of(args: argparse.Namespace) -> Library:
 
 def sources_of(
     args: argparse.Namespace, refuse: Callable[[str, FormatError], object] | None = None
-) -> list[RobotSource]:
+) -> list[RobotReference]:
     """Return the sources of the robots that the arguments name, one or several."""
     from morphgen.grammar.robot_source import find_robots
 
@@ -85,7 +85,7 @@ def sources_of(
     return sources
 
 
-def read_robots(args: argparse.Namespace) -> list[tuple[RobotSource, Robot]]:
+def read_robots(args: argparse.Namespace) -> list[tuple[RobotReference, Robot]]:
     """Return the robots that the arguments name, one or several, with their sources."""
     from morphgen.grammar.robot_source import read_source
 
@@ -97,7 +97,7 @@ def read_robots(args: argparse.Namespace) -> list[tuple[RobotSource, Robot]]:
 
 
 def for_each_robot(
-    args: argparse.Namespace, verb: str, work: Callable[[RobotSource, Library], T]
+    args: argparse.Namespace, verb: str, work: Callable[[RobotReference, Library], T]
 ) -> tuple[dict[str, T], dict[str, dict[str, str]]]:
     """Do something with every robot that the arguments name; a refused one does not stop others.
 

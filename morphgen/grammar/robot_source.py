@@ -31,8 +31,8 @@ RobotLike: TypeAlias = Robot | str | PathLike[str]
 
 
 @dataclass(frozen=True)
-class RobotSource:
-    """Origin of a robot: either a path or the words of a request."""
+class RobotReference:
+    """A robot that a user names: by a path, or by the words of a request."""
 
     label: str  # the path or the words, as printed in messages and tables
     path: Path | None = None
@@ -44,7 +44,7 @@ def find_robots(
     words: Sequence[str],
     library: Library,
     refuse: Callable[[str, FormatError], object] | None = None,
-) -> list[RobotSource]:
+) -> list[RobotReference]:
     """Return the robots that the words of a command line name, without reading them.
 
     Each word is one of: a bundle's folder, a URDF, a xacro or an MJCF; a set of ``morphgen sample``
@@ -55,7 +55,7 @@ def find_robots(
     """
     if not words:
         raise CompositionError("no robot is named; expected one such as ur5-plane or robots/arm3")
-    sources: list[RobotSource] = []
+    sources: list[RobotReference] = []
     is_open = False  # whether key=value words belong to the last source
     for word in words:
         if is_robot_file(word):
@@ -78,7 +78,7 @@ def find_robots(
     return list(dict.fromkeys(sources))
 
 
-def find_robot(text: str | PathLike[str]) -> RobotSource:
+def find_robot(text: str | PathLike[str]) -> RobotReference:
     """Return the one robot that a text names; see ``find_robots``."""
     if not isinstance(text, str | PathLike):
         raise CompositionError(
@@ -94,7 +94,7 @@ def find_robot(text: str | PathLike[str]) -> RobotSource:
     return sources[0]
 
 
-def read_source(source: RobotSource, library: Library, root: Path | None = None) -> Robot:
+def read_source(source: RobotReference, library: Library, root: Path | None = None) -> Robot:
     """Return a robot: read from its file, or composed from its words.
 
     A robot of a light set is composed from its derivation, since its URDF has no home. In a URDF,
@@ -181,14 +181,14 @@ def robots_in(folder: Path) -> Iterator[Path]:
         yield from (child for child in sorted(folder.iterdir()) if is_robot_folder(child))
 
 
-def _file_sources(path: Path) -> list[RobotSource]:
+def _file_sources(path: Path) -> list[RobotReference]:
     """Return the robots of a file or folder."""
     if not path.exists():
         raise FormatError(f"{path}: no such file or folder")
     robots = [path] if path.is_file() else list(robots_in(path))
     if not robots:
         raise _no_robot(path)
-    return [RobotSource(str(robot), robot) for robot in robots]
+    return [RobotReference(str(robot), robot) for robot in robots]
 
 
 def _no_robot(path: Path) -> FormatError:
@@ -201,8 +201,8 @@ def _no_robot(path: Path) -> FormatError:
     )
 
 
-def _request_source(words: Sequence[str]) -> RobotSource:
-    return RobotSource(" ".join(words), words=tuple(words))
+def _request_source(words: Sequence[str]) -> RobotReference:
+    return RobotReference(" ".join(words), words=tuple(words))
 
 
 def import_robot(
