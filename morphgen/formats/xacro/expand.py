@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import json
-import logging
 import re
 import signal
 import subprocess
@@ -49,11 +48,6 @@ Untyped: TypeAlias = Any  # objects of minidom and xacro, which have no type hin
 _LOCATION = "morphgen-location"
 
 
-def location_of(node: Untyped) -> str:
-    """Return ``file:line`` of an element that ``ElementLocations`` parsed, or of a clone of it."""
-    return str(node.getUserData(_LOCATION))
-
-
 class ElementLocations:
     """Source locations of the elements of an expansion; a DOM ``UserDataHandler``.
 
@@ -63,12 +57,6 @@ class ElementLocations:
 
     def __init__(self) -> None:
         self.clones = 0
-
-    def parse(self, data: bytes, origin: str) -> minidom.Document:
-        """Parse XML and store the location of every element."""
-        document = _Builder(origin, self).parseString(data)
-        assert isinstance(document, minidom.Document)
-        return document
 
     def handle(
         self, operation: int, key: str, location: object, source: object, clone: Untyped
@@ -154,7 +142,6 @@ MAX_ELEMENTS = 50_000  # largest number of elements that an expansion may proces
 MAX_TEXT = 20_000_000  # largest text that the substitutions of an expansion may create [characters]
 
 _NAME = "morphgen.formats._xacro"
-_log = logging.getLogger("morphgen.formats.xacro.expand")
 _LOCK = threading.Lock()  # held by an expansion: the state of xacro is that of its module
 
 
@@ -224,14 +211,14 @@ def _symbols(engine: Engine) -> dict[str, object]:
     files = {
         "load_yaml": lambda name: engine.load_yaml(name),
         "abs_filename": engine.abs_filename_spec,
-        "dotify": _same,
+        "dotify": dict,  # dots work on every dictionary here
     }
     calls = {
         **files,
         "arg": lambda name: engine.substitution_args_context["arg"][name],
         "fatal": fatal,
         "tokenize": tokenize,
-        **dict.fromkeys(("message", "warning", "error", "print_location"), _record),
+        **dict.fromkeys(("message", "warning", "error", "print_location"), _discard),
     }
     functions = {name: Function(name, call) for name, call in calls.items()}
     return {
@@ -241,15 +228,9 @@ def _symbols(engine: Engine) -> dict[str, object]:
     }
 
 
-def _same(dictionary: dict[str, object]) -> dict[str, object]:
-    """Return a dictionary unchanged: ``xacro.dotify``, but dots work on every dictionary here."""
-    if not isinstance(dictionary, dict):
-        raise TypeError("dotify() takes a dictionary")
-    return dictionary
-
-
-def _record(*words: object, **_: object) -> str:
-    _log.info(" ".join(map(str, words)))
+def _discard(*words: object, **_: object) -> str:
+    """Return the text of a message of a xacro, which is shown nowhere: nothing."""
+    del words
     return ""
 
 
@@ -257,8 +238,7 @@ def _load_engine() -> Engine:
     """Import a copy of the ``xacro`` module under a private name.
 
     Differences from the package: an allow-list evaluates expressions, the number of elements and
-    the size of text are bounded, ``node`` is the element being processed, and warnings go to the
-    logger ``morphgen.formats.xacro.expand`` (level INFO) instead of the terminal.
+    the size of text are bounded, ``node`` is the element being processed, and nothing is printed.
     """
     spec = importlib.util.find_spec("xacro")
     if spec is None or spec.origin is None:
@@ -270,12 +250,12 @@ def _load_engine() -> Engine:
     assert private.loader is not None
     module: Engine = importlib.util.module_from_spec(private)
     sys.modules[_NAME] = module
-    module.print = _record
+    module.print = _discard
     writer = minidom.Element.writexml
     private.loader.exec_module(module)
     # The import of xacro 2.1.1 replaces minidom's writer for the whole process.
     minidom.Element.writexml = writer  # type: ignore[method-assign]
-    sys.modules[f"{_NAME}.color"].print = _record  # type: ignore[attr-defined]
+    sys.modules[f"{_NAME}.color"].print = _discard  # type: ignore[attr-defined]
     module.eval_text = _shortcut(module)
     module.safe_eval = _safe_eval
     module.glob = SimpleNamespace(glob=lambda pattern: module.list_files(pattern))
@@ -293,8 +273,6 @@ WALL_LIMIT = 30
 """Longest wait for an expansion [s]. On Windows, which has no other limit, the only one."""
 MEMORY_LIMIT = 2**30
 """Largest address space of an expansion [bytes]; Linux enforces it, macOS only in part."""
-MAX_RECORDS = 1000
-"""Most warnings of a document that are passed on to the log, and longest of them [characters]."""
 
 _RECURSION_LIMIT = 4000  # Python frames for nested macros; one level takes about ten
 _CHILD_CODE = (
@@ -338,8 +316,6 @@ def run_in_child(
     if child.returncode:
         raise FormatError(f"{path}: {_failure(child.returncode, child.stderr)}")
     answer: dict[str, Any] = json.loads(child.stdout)
-    for record in answer["records"]:
-        _log.info(record)
     if "error" in answer:
         raise FormatError(answer["error"])
     return answer["result"]
@@ -359,10 +335,6 @@ def _failure(code: int, stderr: bytes) -> str:
 
 def serve(request: Mapping[str, Any]) -> None:
     """Run the parent's task in this process, the child, and print its result as JSON."""
-    records: list[str] = []
-    _log.addHandler(_Recorder(records))
-    _log.setLevel(logging.INFO)
-    _log.propagate = False
     finder = PackageFinder(
         tuple(map(Path, request["roots"])),
         tuple((name, Path(folder)) for name, folder in request["packages"]),
@@ -376,19 +348,7 @@ def serve(request: Mapping[str, Any]) -> None:
         answer = {"result": task(Path(request["path"]), finder, **request["values"])}
     except FormatError as error:
         answer = {"error": str(error)}
-    sys.stdout.write(json.dumps(answer | {"records": records}))
-
-
-class _Recorder(logging.Handler):
-    """Keeps the first messages."""
-
-    def __init__(self, records: list[str]) -> None:
-        super().__init__()
-        self.records = records
-
-    def emit(self, record: logging.LogRecord) -> None:
-        if len(self.records) < MAX_RECORDS:
-            self.records.append(record.getMessage()[:MAX_RECORDS])
+    sys.stdout.write(json.dumps(answer))
 
 
 def limit_process(cpu: int, memory: int) -> None:
@@ -512,7 +472,7 @@ class Expansion:
             yield
         except (self.engine.XacroException, *_FAULTS) as error:
             macros, node = self.engine.macrostack, self.engine.node
-            location = location_of(node) if node is not None else str(self.origin)
+            location = str(node.getUserData(_LOCATION) if node is not None else self.origin)
             macro = f" in macro {macros[-1].body.getAttribute('name')!r}" if macros else ""
             is_included = not location.startswith(str(self.origin))
             including = "" if not is_included else f" (included from {self.origin})"
@@ -521,7 +481,9 @@ class Expansion:
     def _parse(self, data: bytes, origin: str) -> minidom.Document:
         for element in parse_xml(data, origin).iter("{*}arg"):
             self.declared.add(element.get("name", ""))
-        return self.locations.parse(data, origin)
+        document = _Builder(origin, self.locations).parseString(data)
+        assert isinstance(document, minidom.Document)
+        return document
 
     def _parse_include(self, _: object, filename: str) -> minidom.Document:
         files = self.engine.filestack
