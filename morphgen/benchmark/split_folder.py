@@ -59,8 +59,8 @@ from morphgen.formats.data_files import parse_json, read_json, read_text
 from morphgen.formats.files import (
     file_sha256,
     folder_hashes,
+    leftovers,
     locked_folder,
-    partial_path,
     write_atomic,
 )
 from morphgen.formats.urdf.write import urdf_text
@@ -477,9 +477,9 @@ def _prepare(split_folder: Path, split: Split, settings: BuildSettings) -> None:
     build = _Settings(1, split_id(split), settings.light, settings.picture)
     data, text = msgspec.to_builtins(build), split_text(split)
     if not (split_folder / BUILD_FILE).is_file():
-        leftover = {partial_path(split_folder / BUILD_FILE)}
+        first_files = leftovers(split_folder / BUILD_FILE)
         if split_folder.exists() and not (
-            split_folder.is_dir() and leftover >= set(split_folder.iterdir())
+            split_folder.is_dir() and first_files >= set(split_folder.iterdir())
         ):
             raise BenchmarkError(
                 f"{split_folder} exists and is no built split (no {BUILD_FILE}); name another "

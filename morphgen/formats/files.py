@@ -8,7 +8,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 
@@ -97,17 +97,9 @@ def require_writable_folder(folder: Path) -> None:
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:
-    """Write a file atomically, by way of ``partial_path``; one process at a time may do so."""
-    partial = partial_path(path)
-    try:
+    """Write a file by way of ``replacing_file``."""
+    with replacing_file(path) as partial:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
-        partial.replace(path)
-    except BaseException as error:
-        with suppress(OSError):
-            partial.unlink()
-        if isinstance(error, OSError):
-            error.filename = str(path)
-        raise
 
 
 @contextmanager
@@ -130,39 +122,37 @@ def writing(what: object, error_type: type[MorphgenError] = FormatError) -> Iter
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file that the user named; several processes may write the same one."""
+    """Write a file that the user named."""
     with writing(path):
-        _replace(path, content)
+        write_atomic(path, content)
 
 
-def partial_path(path: Path) -> Path:
-    """Return the path where ``write_atomic`` writes a file before it replaces the old one."""
-    return path.with_name(f".{path.name}.partial")
+def write_cache_file(path: Path, content: str | bytes) -> None:
+    """Write a file of a cache and create its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, content)
 
 
 @contextmanager
 def replacing_file(path: Path) -> Iterator[Path]:
     """Yield a path in a temporary folder whose file replaces ``path`` if the block succeeds.
 
-    Unlike ``write_atomic``, concurrent processes may write the same file.
+    Concurrent processes may write the same file. An ``OSError`` names ``path``.
     """
-    # Only a rename within one file system is atomic.
-    with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
-        partial = Path(folder) / path.name
-        yield partial
-        partial.replace(path)
+    try:
+        # Only a rename within one file system is atomic.
+        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+            partial = Path(folder) / path.name
+            yield partial
+            partial.replace(path)
+    except OSError as error:
+        error.filename = str(path)
+        raise
 
 
-def write_cache_file(path: Path, content: str | bytes) -> None:
-    """Write a file of a cache and create its folder; several processes may write the same one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _replace(path, content)
-
-
-def _replace(path: Path, content: str | bytes) -> None:
-    """Write a file by way of ``replacing_file``."""
-    with replacing_file(path) as partial:
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+def leftovers(path: Path) -> set[Path]:
+    """Return the temporary folders of writes of a file that were interrupted."""
+    return {*path.parent.glob(f".{path.name}.*")}
 
 
 @contextmanager

@@ -27,9 +27,9 @@ from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.formats.data_files import read_json, read_text
 from morphgen.formats.files import (
+    leftovers,
     locked_folder,
     naming,
-    partial_path,
     replacing_folder,
     write_atomic,
     writing,
@@ -254,7 +254,7 @@ def _prepare(config: SetConfig) -> None:
 def _is_barely_begun(config: SetConfig) -> bool:
     """Return whether a folder is empty or has only the first files of an interrupted run."""
     grammar = config.folder / GRAMMAR
-    first_files = {partial_path(grammar), partial_path(config.folder / SETTINGS)}
+    first_files = leftovers(grammar) | leftovers(config.folder / SETTINGS)
     if grammar.is_file() and grammar.read_bytes() == config.grammar_text.encode():
         first_files.add(grammar)
     return config.folder.is_dir() and first_files >= set(config.folder.iterdir())

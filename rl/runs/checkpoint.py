@@ -22,7 +22,7 @@ import torch
 from morphgen.encoding.tokens import MAX_LINKS
 from morphgen.errors import MALFORMED, MorphgenError, TaskError, nearest, shortened
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import LOCK, partial_path, write_atomic, writing
+from morphgen.formats.files import LOCK, leftovers, write_atomic, writing
 from morphgen.formats.records import Record, read_record
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import PolicyConfig, PPOConfig, differences, policy_from, read_fields
@@ -381,8 +381,8 @@ def require_open(folder: Path, config: RunConfig, *, resume: bool) -> None:
     elif path.is_file():
         read_config(folder)
     elif folder.is_dir():
-        leftovers = (LOCK, partial_path(path).name)  # of a run that was killed at its start
-        if any(entry.name not in leftovers for entry in folder.iterdir()):
+        first_files = {folder / LOCK, *leftovers(path)}  # of a run that was killed at its start
+        if not first_files >= set(folder.iterdir()):
             raise TaskError(
                 f"{folder} exists and is not the folder of a run: name another with --out"
             )

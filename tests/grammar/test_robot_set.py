@@ -161,12 +161,15 @@ def test_partially_written_robots_are_removed(tmp_path, whole):
     assert tree(config.folder) == tree(whole)
 
 
-@pytest.mark.parametrize("left", [[], [f".{GRAMMAR}.partial"], [GRAMMAR, f".{SETTINGS}.partial"]])
+@pytest.mark.parametrize("left", [[], [f".{GRAMMAR}.x1y2"], [GRAMMAR, f".{SETTINGS}.x1y2"]])
 def test_a_folder_interrupted_before_the_first_robot_can_be_continued(tmp_path, whole, left):
     config = plan(tmp_path / "s")
     config.folder.mkdir()
     for name in left:
-        (config.folder / name).write_text(config.grammar_text if name == GRAMMAR else "{")
+        if name == GRAMMAR:
+            (config.folder / name).write_text(config.grammar_text)
+        else:
+            (config.folder / name).mkdir()
     make_set(config, 8, make_in_processes())
     assert tree(config.folder) == tree(whole)
 
