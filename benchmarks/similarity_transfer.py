@@ -48,7 +48,7 @@ from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.files import write_atomic
 from morphgen.grammar.library import Library, default_library
 from morphgen.rl.runs.robot_source import read_drawn
-from morphgen.splits.candidates import ComposedRecipe, RobotFactory, members
+from morphgen.splits.candidates import RobotFactory, members, recipe_of
 from morphgen.splits.split import Member, Split
 from morphgen.splits.split_file import read_split
 from morphgen.typing import Array
@@ -92,7 +92,7 @@ def read_policies(args: argparse.Namespace, library: Library) -> Iterator[Policy
         TaskError: If the folder of a run is missing, or does not list its robots.
     """
     make = RobotFactory(library)
-    recipes = [ComposedRecipe((f"arm={arm}", "ee=stick")) for arm in REAL_ARMS]
+    recipes = [recipe_of((f"arm={arm}", "ee=stick"), library) for arm in REAL_ARMS]
     arms = {arm.name: arm for arm in members(map(make, recipes), ("reach",), obstacles=False)}
     stored = read_scores(args.results)
     for variant, robots, seed in product(args.variants, args.robots, args.seeds):

@@ -22,8 +22,8 @@ from tqdm import tqdm
 
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.generate import SplitRequest, extrapolation
+from morphgen.benchmark.release import verify
 from morphgen.benchmark.split_folder import BuildSettings, build_split
-from morphgen.benchmark.verify import verify
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import default_library
 from morphgen.splits.split import Split

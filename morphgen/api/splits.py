@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from numbers import Integral
@@ -11,22 +12,33 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, overload
 
 from morphgen.arguments import checked_signature, path_argument, truth, whole_number
-from morphgen.benchmark.audit import Audit, audit
-from morphgen.benchmark.generate import SplitRequest
-from morphgen.benchmark.goal_audit import audit_goals, goals_to_audit, with_goal_findings
+from morphgen.benchmark.audit import Audit, audit, audit_goals, goals_to_audit, with_goal_findings
+from morphgen.benchmark.generate import (
+    SplitRequest,
+    composition,
+    extrapolation,
+    interpolation,
+    parse_bound,
+)
+from morphgen.benchmark.hold_out import hold_out
 from morphgen.benchmark.licences import LicencedPart, licenced_parts
-from morphgen.benchmark.new_split import RobotChoice, choose_robots, default_name
-from morphgen.benchmark.release import build_with_goals
-from morphgen.benchmark.split_folder import BuildSettings, read_split_or_folder
+from morphgen.benchmark.release import build_with_goals, verify
+from morphgen.benchmark.split_folder import (
+    BuildSettings,
+    Difference,
+    compare_robots,
+    read_split_or_folder,
+)
 from morphgen.benchmark.survey import statistics
-from morphgen.benchmark.verify import Difference, compare_robots, verify
 from morphgen.encoding.similarity import NEAR_THRESHOLDS, NearThresholds
 from morphgen.encoding.tokens import MAX_LINKS
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.extras import explain_missing_extras
+from morphgen.grammar.analysis import load_sound_grammar
 from morphgen.grammar.library import Library, LibraryFolders, default_library
 from morphgen.model.robot import Robot
-from morphgen.splits.split import HOLD_OUT, Regime, Split, compose_side
+from morphgen.progress import part_of
+from morphgen.splits.split import HOLD_OUT, REGIMES, Regime, Split, compose_side
 from morphgen.splits.split_file import require_split_name, split_paths, write_new_splits
 from morphgen.tasks.goals.split_goals import sample_split_goals
 from morphgen.tasks.registry import TASKS
@@ -110,7 +122,7 @@ class LoadedSplit:
     ) -> Audit:
         """Find leaks between train and test robots, and between the goal sets of a built split.
 
-        See ``morphgen.benchmark.audit.audit`` and ``morphgen.benchmark.goal_audit.audit_goals``.
+        See ``morphgen.benchmark.audit.audit`` and ``morphgen.benchmark.audit.audit_goals``.
 
         Args:
             near: Thresholds of near duplicates.
@@ -334,9 +346,9 @@ def split(
             valid = NewSplit.__optional_keys__ | {"train", "library"}
             raise BenchmarkError(f"split: unknown argument {key!r}{nearest(key, valid)}")
     jobs, with_statistics = choice.pop("jobs", 1), choice.pop("statistics", False)
-    rules, request = _parse(str(name), train, **choice)
+    regime, rules, request = _parse(str(name), train, **choice)
     require_split_name(request.name)
-    splits = choose_robots(rules, request, parts, jobs=jobs)
+    splits = _choose(regime, rules, request, parts, jobs)
     if with_statistics:
         splits = tuple(
             replace(each, statistics=statistics(each, parts, jobs=jobs)) for each in splits
@@ -345,23 +357,35 @@ def split(
     return loaded[0] if train is None or isinstance(train, Integral) else loaded
 
 
+_RULES: Mapping[Regime, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "interpolation": (("grammar",), ("hull",)),
+    "composition": (("robots",), ()),
+    "extrapolation": (("train_category", "test_category"), ("similarity",)),
+    "hold-out": (("hold_out",), ("robots", "grammar")),
+}
+"""Arguments that a regime needs, and further ones that have an effect."""
+MAX_WORD = 60
+"""Largest number of characters of what is held out in the name of a split."""
+Rules = Mapping[str, tuple[str, ...]]
+"""Arguments of ``split`` by which robots are chosen, without those that are not given."""
+
+
 def _parse(
     name: str,
     train: int | Sequence[int] | None,
     *,
     regime: Regime = HOLD_OUT,
-    hull: str = "",
-    similarity: str = "",
     test: int = 1,
     task: Names = "reach",
     obstacles: bool = False,
     seed: int = 0,
     max_links: int = MAX_LINKS,
     **names: Names,
-) -> tuple[RobotChoice, SplitRequest]:
-    """Return the rules and the request that the arguments of ``split`` describe."""
+) -> tuple[Regime, Rules, SplitRequest]:
+    """Return regime, rules and request that the arguments of ``split`` describe."""
     several = {key: _several(key, value) for key, value in names.items()}
-    rules = RobotChoice(regime, hull=hull, similarity=similarity, **several)
+    rules = {key: texts for key, texts in several.items() if any(texts)}
+    _require_rules(regime, rules)
     tasks = _several("task", task)
     for each in tasks:
         if each not in TASKS:
@@ -377,8 +401,62 @@ def _parse(
         for what, value in (("test", test), ("seed", seed), ("max_links", max_links))
     )
     obstacles = truth("split: obstacles", obstacles, BenchmarkError)
-    name = name or default_name(rules, tasks, obstacles, seed)
-    return rules, SplitRequest(name, sizes, test, tasks, obstacles, seed, max_links)
+    if not name:
+        boxes = ["obstacles"] if obstacles else []
+        name = "-".join([regime, _word(regime, rules), *tasks, *boxes, f"seed{seed}"])
+    return regime, rules, SplitRequest(name, sizes, test, tasks, obstacles, seed, max_links)
+
+
+def _require_rules(regime: Regime, rules: Rules) -> None:
+    """Require the rules that a regime needs, and no others."""
+    if regime not in REGIMES:
+        raise BenchmarkError(f"unknown regime {regime!r}{nearest(regime, REGIMES)}")
+    required, optional = _RULES[regime]
+    listed = ", ".join([*required, *optional])
+    for key in required:
+        if key not in rules:
+            raise BenchmarkError(f"{regime}: {key} is missing; valid: {listed}")
+    for key in rules:
+        if key not in (*required, *optional):
+            raise BenchmarkError(f"{regime}: no effect of {key}; valid: {listed}")
+    if regime == "interpolation" and len(rules["grammar"]) > 1:
+        raise BenchmarkError(f"interpolation: {len(rules['grammar'])} grammars; expected one")
+
+
+def _word(regime: Regime, rules: Rules) -> str:
+    """Return a word for the robots in the default name of a split."""
+    if regime == HOLD_OUT:
+        words = re.findall(r"[A-Za-z0-9_.]+", ",".join(rules["hold_out"]))
+        return "-".join(words)[:MAX_WORD].strip("-.")
+    if regime == "composition":
+        words = " ".join(rules["robots"]).split()
+        keys = dict.fromkeys(word.partition("=")[0] for word in words if "={" in word)
+        return "-".join(keys) or "robots"
+    grammars = [Path(name).stem for name in rules.get("test_category") or rules["grammar"]]
+    return "-".join([*grammars, *(hull for hull in rules.get("hull", ()) if hull != "any")])
+
+
+def _choose(
+    regime: Regime, rules: Rules, request: SplitRequest, library: Library, jobs: int
+) -> tuple[Split, ...]:
+    """Return a split for each size of a request."""
+    grammars, train, test = (
+        [load_sound_grammar(name, library) for name in rules.get(key, ())]
+        for key in ("grammar", "train_category", "test_category")
+    )
+    patterns = rules.get("robots", ())
+    with part_of(request.train[-1] + request.test if request.train else None):
+        if regime == "interpolation":
+            hull = ",".join(rules.get("hull", ("any",)))
+            return interpolation(request, grammars[0], library, hull=hull, jobs=jobs)
+        if regime == "composition":
+            return composition(request, patterns, library, jobs=jobs)
+        if regime == "extrapolation":
+            text = ",".join(rules.get("similarity", ()))
+            bound = parse_bound(text) if text else None
+            return extrapolation(request, train, test, library, similarity=bound, jobs=jobs)
+        held_out = rules["hold_out"]
+        return hold_out(request, held_out, library, patterns=patterns, grammars=grammars, jobs=jobs)
 
 
 def _several(key: str, names: Names) -> tuple[str, ...]:

@@ -1,10 +1,24 @@
-"""Audit a split: leaks between train and test, violated rules, and nearest train robots."""
+"""Audit a split: leaks between train and test, violated rules, and nearest train robots.
+
+The audit of goal sets finds sets that do not match their robots, and goals that leak. A goal of a
+test robot has leaked if a train robot at the same task has it too. For the same robot, any such
+goal counts. Different robots reach a pose in different configurations, so a shared goal reveals
+nothing, and robots that can move little share some by chance. But if most of a set is shared, in
+its goals or in its configurations, then the two sets were not drawn independently, and memorised
+goals of one would count as skill with the other.
+
+The goal of reach is the pose of the tool; of push, the pose of the block at the start, together
+with the start configuration if the robots are the same.
+"""
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +27,25 @@ from morphgen.benchmark.generate import parse_bound
 from morphgen.benchmark.hold_out import has_hold_out_rules, hold_out_findings
 from morphgen.benchmark.regimes import regime_findings
 from morphgen.benchmark.survey import Fault, SplitSurvey, SurveyedRobot, nearest_train, survey_split
+from morphgen.encoding.robot_hash import robot_hash
 from morphgen.encoding.similarity import NEAR_THRESHOLDS, NearThresholds, is_same_reach
+from morphgen.errors import MorphgenError, nearest
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding, Severity
+from morphgen.processes import parallel_map
 from morphgen.splits.split import SIDES, Member, Side, Split, sided_members
+from morphgen.tasks.goals.goal_sets import arrays_of
+from morphgen.tasks.goals.split_goals import (
+    GoalResult,
+    SplitGoals,
+    certify_goal_set,
+    has_goals,
+    read_split_goals,
+)
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, member_with_primitives
+from morphgen.tasks.task import GoalSet
+from morphgen.typing import Array
 
 _FIXES = {
     "part-missing": "name the folder of your parts with --library, or correct the derivation",
@@ -28,6 +57,16 @@ _FIXES = {
     "body-repeated": "leave one out",
     "similarity-bound": "draw another test robot, or correct what the split says of its making",
     "name-shared": "rename one: what is stored by name, such as goals, would pass for the other's",
+    "task-unknown": "correct the task, or install the package that has it",
+    "goals-missing": "leave the robot out, or build again: morphgen split build --goals",
+    "goals-unknown": "build the goal sets again",
+    "goals-body": "build the goal sets again",
+    "goals-seed": "build the goal sets again, with the seed of the split",
+    "goals-config": "build the goal sets again, with one morphgen",
+    "goals-changed": "build the goal sets again",
+    "goals-unproven": "build the goal sets again",
+    "goals-shared": "leave the robot out of one side, or accept it with a reason",
+    "goals-repeated": "take another --goal-seed, or accept it with a reason",
 }
 
 
@@ -109,10 +148,10 @@ def audit_survey(
         *_regime_findings(survey, library),
         *_bound_findings(survey),
     ]
-    return conclude(split, findings, tuple(_neighbours(survey)))
+    return _conclude(split, findings, tuple(_neighbours(survey)))
 
 
-def conclude(
+def _conclude(
     split: Split,
     findings: Sequence[Finding],
     neighbours: tuple[Neighbour, ...],
@@ -143,12 +182,12 @@ def _robot_findings(survey: SplitSurvey) -> Iterator[Finding]:
     """Yield robots that cannot be composed, or that have changed."""
     for side, member, robot in _robots(survey):
         if isinstance(robot, Fault):
-            yield _finding(robot.code, side, member, robot.why)
+            yield _finding(robot.code, side, member.name, robot.why)
         elif robot.robot_hash != member.robot_hash:
             why = (
                 f"the split names body {member.robot_hash}, its derivation gives {robot.robot_hash}"
             )
-            yield _finding("body-changed", side, member, why)
+            yield _finding("body-changed", side, member.name, why)
 
 
 def _leaks(survey: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
@@ -164,7 +203,7 @@ def _leaks(survey: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
         if shared:
             twin = _first_of(split, shared)
             why = f"train robot {twin} has the same body, and learns the same task"
-            yield _finding("body-shared", "test", member, why)
+            yield _finding("body-shared", "test", member.name, why)
         duplicates = sorted(
             (i for i in rivals if is_near[i, j] and i not in shared), key=tree[:, j].item
         )
@@ -176,23 +215,19 @@ def _leaks(survey: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
                 f"workspace overlap {workspace[first, j]:.4f} (one above {near.cosine:g} or "
                 f"{near.workspace:g}, the latter at the same reach)"
             )
-            yield _finding("body-near", "test", member, why)
+            yield _finding("body-near", "test", member.name, why)
         other = names.get(member.name)
         if other is not None and other.robot_hash != member.robot_hash:
             why = "a train robot of another body has the same name"
-            yield _finding("name-shared", "test", member, why)
+            yield _finding("name-shared", "test", member.name, why)
 
 
 def _same_reach(survey: SplitSurvey, near: NearThresholds) -> NDArray[np.bool_]:
     """Return which pairs have nearly one reach, shape (n_train, n_test)."""
+    n = len(survey.split.train)
     train, test = (
-        np.array(
-            [
-                np.nan if isinstance(each, Fault) else each.features.workspace.reach
-                for each in robots
-            ]
-        )
-        for robots in (survey.train, survey.test)
+        np.array([each.workspace.reach if each else np.nan for each in known])
+        for known in (survey.features[:n], survey.features[n:])
     )
     return is_same_reach(train[:, None], test[None, :], near)
 
@@ -207,7 +242,7 @@ def _repeated(split: Split) -> Iterator[Finding]:
             earlier = first.setdefault(key, member.name)
             if earlier != member.name:
                 why = f"{side} robot {earlier} has the same body and task"
-                yield replace(_finding("body-repeated", side, member, why), severity=severity)
+                yield _finding("body-repeated", side, member.name, why, severity)
 
 
 def _regime_findings(survey: SplitSurvey, library: Library) -> tuple[Finding, ...]:
@@ -238,7 +273,7 @@ def _bound_findings(survey: SplitSurvey) -> Iterator[Finding]:
                 f"its cosine to the nearest train robot is {largest:.3f}, and the split was made "
                 f"with {bound}"
             )
-            yield _finding("similarity-bound", "test", member, why)
+            yield _finding("similarity-bound", "test", member.name, why)
 
 
 def _neighbours(survey: SplitSurvey) -> Iterator[Neighbour]:
@@ -259,5 +294,240 @@ def _first_of(split: Split, indices: Sequence[int]) -> str:
     return split.train[indices[0]].name + more
 
 
-def _finding(code: str, side: Side, member: Member, why: str) -> Finding:
-    return Finding(code, "error", f"{side} robot {member.name}", why, _FIXES[code])
+def _finding(code: str, side: Side, name: str, why: str, severity: Severity = "error") -> Finding:
+    return Finding(code, severity, f"{side} robot {name}", why, _FIXES[code])
+
+
+Mask = NDArray[np.bool_]
+SidedReason = tuple[Side, str, str]  # side and name of a robot, and the reason of its finding
+
+EXACT = 1e-6  # largest difference between numbers of a set and those of the same set sampled anew
+NEAR = 1e-3  # distance below which positions of goals or blocks are the same [m]
+NEAR_TURN = math.radians(1)  # angle below which orientations are the same [rad]
+NEAR_JOINT = 1e-3  # difference of every joint below which configurations are the same [rad or m]
+MAX_SHARED = 0.5  # fraction of a set that two different robots may have in common
+
+
+def goals_to_audit(
+    folder: Path | None,
+    seed: int | None,
+    sample: Callable[[GoalConfig], Sequence[GoalResult]] | None,
+) -> SplitGoals | None:
+    """Return the goal sets that an audit of a split tests; None if it tests none."""
+    if folder is not None and has_goals(folder):
+        goals = read_split_goals(folder)
+        return goals if seed is None else replace(goals, config=replace(goals.config, seed=seed))
+    if sample is None:
+        return None
+    config = GoalConfig(seed or 0)
+    return SplitGoals.from_results(sample(config), config)
+
+
+def audit_goals(
+    split: Split, goals: SplitGoals, library: Library, *, jobs: int = 1
+) -> tuple[Finding, ...]:
+    """Find goals that leak, and sets that do not match the split's robots.
+
+    Every set is sampled anew for comparison, and every goal is tested with its configuration.
+    Errors: ``goals-missing`` (a member has no set, or none can be sampled), ``goals-unknown`` (a
+    set without a member), ``goals-body`` (of another robot), ``goals-seed`` and ``goals-config``
+    (made with another seed or other constants than those of the split's sets), ``goals-changed``
+    (differs from the set sampled anew), ``goals-unproven`` (out of reach or in collision),
+    ``goals-shared`` (by train and test, see the module). Warning: ``goals-repeated`` (within a
+    set).
+    """
+    members = sided_members(split)
+    examined = list(parallel_map(partial(_examine, library, goals), members, jobs))
+    return (
+        *_set_findings(split, goals, members, examined),
+        *(_finding("goals-shared", *reason) for reason in shared_goals(split, goals)),
+        *(
+            _finding("goals-repeated", *reason, "warning")
+            for reason in _repeated_goals(split, goals)
+        ),
+    )
+
+
+def with_goal_findings(audit: Audit, split: Split, findings: Sequence[Finding] | None) -> Audit:
+    """Return an audit with findings about goals added, those that the split accepts as accepted.
+
+    A task that is unknown here is found, too: error ``task-unknown``.
+    """
+    found = [finding for finding in audit.findings if finding.code != "accepted-unused"]
+    found += [finding for finding, _ in audit.accepted]
+    for side, member in sided_members(split):
+        if member.task not in TASKS:
+            reason = f"its task {member.task!r} is unknown{nearest(member.task, TASKS)}"
+            found.append(_finding("task-unknown", side, member.name, reason))
+    goal_codes = [code for code in _FIXES if code.startswith(("goals-", "task-"))]
+    not_audited = goal_codes if findings is None else ()
+    return _conclude(split, [*found, *(findings or ())], audit.neighbours, not_audited)
+
+
+@dataclass(frozen=True)
+class _Examination:
+    """A member's goal set, compared with the same set sampled anew."""
+
+    key: str = ""  # key of the set sampled anew; empty if it cannot be sampled
+    robot_hash: str = ""  # hash of the member's robot
+    error: str = ""  # reason why the set cannot be sampled
+    is_same: bool = False  # whether the set equals the one sampled anew
+    certificate_errors: tuple[str, ...] = ()
+
+
+def _examine(
+    library: Library, goals: SplitGoals, sided_member: tuple[Side, Member]
+) -> _Examination:
+    """Sample the goal set of a member anew and compare, in a worker process."""
+    side, member = sided_member
+    stored = goals.sets.get((side, member.name))
+    try:
+        robot = member_with_primitives(member, library)
+        digest = robot_hash(robot, visuals=False)
+        spec = env_spec(robot, member.task, goals.config, obstacles=member.obstacles, anew=True)
+        key = spec.goals.key
+        if stored is None or stored.goals is None:
+            return _Examination(key, digest)
+        errors = certify_goal_set(stored.goals, spec) if stored.robot_hash == digest else ()
+        return _Examination(key, digest, "", _are_equal(stored.goals, spec.goals), errors)
+    except MorphgenError as error:
+        return _Examination(error=str(error))
+
+
+def _are_equal(a: GoalSet, b: GoalSet) -> bool:
+    """Return whether two sets are equal up to rounding, in the fields that are compared."""
+    if type(a) is not type(b):
+        return False
+    arrays_a, arrays_b = arrays_of(a), arrays_of(b)
+    for name in arrays_a.keys() - a.not_compared:
+        x, y = arrays_a[name], arrays_b[name]
+        if x.shape != y.shape or x.dtype.kind != y.dtype.kind:
+            return False
+        if not (np.allclose(x, y, 0, EXACT) if x.dtype.kind == "f" else (x == y).all()):
+            return False
+    return True
+
+
+def _set_findings(
+    split: Split,
+    goals: SplitGoals,
+    members: Sequence[tuple[Side, Member]],
+    examined: Sequence[_Examination],
+) -> Iterator[Finding]:
+    """Yield findings about sets that are missing, of another robot or config, or uncertified."""
+    owners = {
+        one.key: f"{side} robot {member.name}"
+        for (side, member), one in zip(members, examined, strict=True)
+        if one.key
+    }
+    for (side, member), one in zip(members, examined, strict=True):
+        result = goals.sets.get((side, member.name))
+        if one.error or result is None or result.goals is None:
+            reason = one.error or "it has no goal set"
+            yield _finding("goals-missing", side, member.name, reason)
+            continue
+        mismatch = _mismatch(result, result.goals, member, one, owners, goals.config)
+        if mismatch:
+            yield _finding(mismatch[0], side, member.name, mismatch[1])
+        if errors := one.certificate_errors:
+            more = f" (and {len(errors) - 1} more)" if errors[1:] else ""
+            yield _finding("goals-unproven", side, member.name, errors[0] + more)
+    members_of_split = {(side, member.name) for side, member in members}
+    for side, name in sorted(goals.sets.keys() - members_of_split):
+        yield _finding("goals-unknown", side, name, f"split {split.name} has no such robot")
+
+
+def _mismatch(
+    result: GoalResult,
+    goals: GoalSet,
+    member: Member,
+    examined: _Examination,
+    owners: Mapping[str, str],
+    config: GoalConfig,
+) -> tuple[str, str] | None:
+    """Return the code and reason if a set is not the one that is sampled for its member."""
+    if goals.key == examined.key and result.robot_hash == examined.robot_hash:
+        reason = f"its goals are not those that seed {config.seed} gives"
+        return None if examined.is_same else ("goals-changed", reason)
+    if goals.key != examined.key and goals.key in owners:
+        return "goals-body", f"its set is that of {owners[goals.key]}"
+    if result.robot_hash != examined.robot_hash:
+        reason = f"its set is of body {result.robot_hash}, not of {examined.robot_hash}"
+        return "goals-body", reason
+    if goals.seed != config.seed:
+        reason = f"its set was made with seed {goals.seed}, the split's with {config.seed}"
+        return "goals-seed", reason
+    made_for = _task_text(result.task, bool(goals.obstacles))
+    expected = _task_text(member.task, member.obstacles)
+    if made_for != expected:
+        return "goals-config", f"its set is for {made_for}, not {expected}"
+    return "goals-config", (
+        f"its set, of {len(goals.q)} goals, was made with other constants or another version: its "
+        f"key is {goals.key[:8]}, not {examined.key[:8]}"
+    )
+
+
+def _task_text(task: str, obstacles: bool) -> str:
+    return f"{task} with obstacles" if obstacles else task
+
+
+def shared_goals(split: Split, goals: SplitGoals) -> Iterator[SidedReason]:
+    """Yield test robots whose goals leaked into the set of a train robot."""
+    for member in split.test:
+        test = goals.get("test", member.name)
+        leaks: list[tuple[int, str, str]] = []
+        for rival in split.train:
+            train = goals.get("train", rival.name)
+            if test is not None and train is not None and rival.task == member.task:
+                count, noun = _num_shared(test, train, rival.robot_hash == member.robot_hash)
+                leaks += [(count, noun, rival.name)] if count else []
+        if test is not None and leaks:
+            count, noun, name = max(leaks, key=lambda leak: leak[0])
+            more = f" (and {len(leaks) - 1} more)" if leaks[1:] else ""
+            reason = f"train robot {name}{more} has {count} of its {len(test.q)} {noun}"
+            yield "test", member.name, reason
+
+
+def _num_shared(test: GoalSet, train: GoalSet, same_robot: bool) -> tuple[int, str]:
+    """Return how many goals of a test set leaked into a train set, and a noun for them."""
+    same_q = _near_joints(test.q, train.q)
+    same_pose = _near(test.goal_poses, train.goal_poses)
+    if same_robot:
+        same = same_pose & same_q if test.start_belongs_to_goal else same_pose
+        return int(same.any(axis=1).sum()), "goals"
+    counts = {
+        "goals": int(same_pose.any(axis=1).sum()),
+        "configurations": int(same_q.any(axis=1).sum()),
+    }
+    noun, count = max(counts.items(), key=lambda item: item[1])
+    return (count, noun) if count > MAX_SHARED * len(test.q) else (0, noun)
+
+
+def _repeated_goals(split: Split, goals: SplitGoals) -> Iterator[SidedReason]:
+    """Yield robots whose set has a goal twice."""
+    for side, member in sided_members(split):
+        goal_set = goals.get(side, member.name)
+        if goal_set is None:
+            continue
+        same = _near(goal_set.goal_poses, goal_set.goal_poses)
+        if goal_set.start_belongs_to_goal:
+            same &= _near_joints(goal_set.q, goal_set.q)
+        pairs = np.argwhere(np.triu(same, 1)).tolist()
+        if pairs:
+            more = f" (and {len(pairs) - 1} more pairs)" if pairs[1:] else ""
+            reason = f"goals {pairs[0][0]} and {pairs[0][1]} of its set are the same{more}"
+            yield side, member.name, reason
+
+
+def _near(a: Array, b: Array) -> Mask:
+    """Return which poses (n, 7) and (m, 7) are the same, shape (n, m)."""
+    distance = np.linalg.norm(a[:, None, :3] - b[None, :, :3], axis=2)
+    aligned = np.abs(a[:, 3:] @ b[:, 3:].T)
+    return np.asarray((distance <= NEAR) & (aligned >= math.cos(NEAR_TURN / 2)))
+
+
+def _near_joints(a: Array, b: Array) -> Mask:
+    """Return which configurations (n, dof) and (m, dof) are the same, shape (n, m)."""
+    if a.shape[1] != b.shape[1]:
+        return np.zeros((len(a), len(b)), dtype=np.bool_)
+    return np.asarray((np.abs(a[:, None] - b[None]) <= NEAR_JOINT).all(axis=2))

@@ -11,7 +11,7 @@ from morphgen.errors import BenchmarkError, MorphgenError, TaskError, nearest
 from morphgen.grammar.library import Library
 from morphgen.model.kinematics import reach
 from morphgen.processes import parallel_map
-from morphgen.splits.split import SIDES, Member, Side, Split
+from morphgen.splits.split import Member, Side, Split, sided_members
 from morphgen.tasks.goals.goal_sets import goal_set_key
 from morphgen.tasks.registry import SIMULATORS, TASKS
 from morphgen.tasks.scenes.env_specs import (
@@ -96,15 +96,15 @@ def protocol_from(data: Mapping[str, Any], where: str) -> EvalProtocol:
 
 def tasks_of_split(split: Split) -> tuple[str, ...]:
     """Return the tasks of a split's robots, without repetition."""
-    return tuple(dict.fromkeys(each.task for side in SIDES for each in split.side(side)))
+    return tuple(dict.fromkeys(each.task for _, each in sided_members(split)))
 
 
 def expected_robots(
     split: Split, protocol: EvalProtocol, library: Library, *, jobs: int = 1
 ) -> list[ExpectedRobot]:
     """Return what a submission must hold for every member, train robots first."""
-    members = [(side, member) for side in SIDES for member in split.side(side)]
-    return list(parallel_map(partial(_expect, library, protocol.goals), members, jobs))
+    expect = partial(_expect, library, protocol.goals)
+    return list(parallel_map(expect, sided_members(split), jobs))
 
 
 def _expect(library: Library, goals: GoalConfig, sided: tuple[Side, Member]) -> ExpectedRobot:

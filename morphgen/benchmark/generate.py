@@ -9,7 +9,7 @@ import itertools
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,7 +33,7 @@ from morphgen.processes import parallel_map
 from morphgen.progress import report, show_progress
 from morphgen.splits.candidates import (
     Candidate,
-    ComposedRecipe,
+    DerivedRecipe,
     RobotFactory,
     SampledRecipe,
     members,
@@ -313,7 +313,9 @@ def composition(
     """
     candidates = list(_candidates(patterns, request.tasks, library))
     sequence = np.random.SeedSequence(request.seed)
-    test, train = hold_out(candidates, request.test, max(request.train, default=1), sequence)
+    test, train = hold_out_combinations(
+        candidates, request.test, max(request.train, default=1), sequence
+    )
     shortest = num_covering(train, test)
     if request.train and request.train[0] < shortest:
         names = ", ".join(candidate.name for candidate in train[:shortest])
@@ -322,9 +324,7 @@ def composition(
             f"of the test robots is trained, such as {names}"
         )
     members = [*train[: request.train[-1] if request.train else None], *test]
-    unique = {
-        candidate.text: ComposedRecipe(candidate.words, candidate.name) for candidate in members
-    }
+    unique = {candidate.text: candidate.recipe for candidate in members}
     factory = RobotFactory(library, with_features=True, max_links=request.max_links)
     composed_robots = parallel_map(factory, list(unique.values()), jobs)
     robot_of = dict(zip(unique, composed_robots, strict=True))
@@ -367,7 +367,7 @@ def _candidates(
     """Yield every robot of the patterns once for each task."""
     name_by_derivation: dict[str, str] = {}
     for robot in itertools.chain.from_iterable(pattern_robots(p, library) for p in patterns):
-        derivation, name = robot.derivation, robot.name
+        derivation, name = robot.recipe.derivation, robot.recipe.name
         if str(derivation) in name_by_derivation:
             continue
         if name in name_by_derivation.values():
@@ -376,7 +376,7 @@ def _candidates(
         *_, last = (node.part for node in derivation.walk() if node.part != NOTHING)
         properties = (str(derivation), combination(derivation), parts(derivation), last)
         for task in tasks:
-            yield HoldOutCandidate(name, robot.words, *properties, task)
+            yield HoldOutCandidate(name, replace(robot.recipe, name=name), *properties, task)
 
 
 @dataclass(frozen=True)
@@ -384,7 +384,7 @@ class HoldOutCandidate:
     """A robot with a task, which may become a train or a test member."""
 
     name: str
-    words: tuple[str, ...]  # arguments of `morphgen compose`
+    recipe: DerivedRecipe
     text: str  # derivation of the robot
     combination: str  # parts and ports, see `regimes.combination`
     parts: frozenset[str]
@@ -397,7 +397,7 @@ class HoldOutCandidate:
         return {*self.parts, f"task {self.task}"}
 
 
-def hold_out(
+def hold_out_combinations(
     candidates: Sequence[HoldOutCandidate], n: int, min_train: int, seed: np.random.SeedSequence
 ) -> tuple[list[HoldOutCandidate], list[HoldOutCandidate]]:
     """Choose test candidates of as many combinations as possible; return them and train candidates.

@@ -43,7 +43,6 @@ from morphgen.splits.candidates import (
     RobotFactory,
     SampledRecipe,
     UnfitRobotError,
-    category_of,
 )
 from morphgen.splits.split import HOLD_OUT, HOLD_OUT_KEY, Member, Side, Split
 
@@ -219,6 +218,13 @@ MAX_VALUE_DRAWS = 100
 """Draws of the values of one robot until it is one that no rule holds out; then it has none."""
 
 
+_Key: TypeAlias = tuple[int, ...]
+_Item: TypeAlias = tuple[str, object]
+
+STRATA = ("arm", "ee", "body", "base")
+"""Kinds of parts whose use is balanced, the most important first. Segments are repeated at will."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Draft:
     """A robot that may be drawn; it is composed when it is."""
@@ -226,19 +232,15 @@ class _Draft:
     recipe: SampledRecipe | DerivedRecipe
     derivation: Derivation
     """Parts and values; those of a sampled robot may change when it is composed."""
-    category: str
     rules: tuple[int, ...]
     """Numbers of the rules that hold for the robot; none if it may be trained on."""
     parts: frozenset[str]
-    held_out: frozenset[str]  # parts that are held out as such
-    matching: frozenset[str]  # parts that the rules hold for, alone or in a combination
-    parts_by_kind: Mapping[str, frozenset[str]]
+    required: frozenset[str]
+    """Parts that some train robot must have if this is a test robot."""
+    strata: tuple[list[_Item], ...]
+    """What is balanced, the most important group first: rules, parts that they hold for, alone or
+    in a combination, category, and parts by their kind."""
     order: str  # random text that decides between robots that are equally good
-
-    @property
-    def required(self) -> frozenset[str]:
-        """Parts that some train robot must have if this is a test robot."""
-        return self.parts - self.held_out
 
 
 @dataclass(frozen=True)
@@ -249,27 +251,27 @@ class _DraftMaker:
     library: Library
     seed: int
 
-    def draft(
-        self, recipe: SampledRecipe | DerivedRecipe, derivation: Derivation, category: str
-    ) -> _Draft:
+    def draft(self, recipe: SampledRecipe | DerivedRecipe, derivation: Derivation) -> _Draft:
         """Return the draft of a derivation."""
-        holding = tuple(
-            number for number, rule in enumerate(self.rules) if rule.holds(derivation, self.library)
-        )
-        by_kind: dict[str, frozenset[str]] = {}
-        for node in derivation.walk():
-            kind = self.library.manifest(node.part).kind
-            by_kind[kind] = by_kind.get(kind, frozenset()) | {node.part}
-        matching = (self.rules[n].matching_parts(derivation, self.library) for n in holding)
+        library = self.library
+        numbers = [n for n, rule in enumerate(self.rules) if rule.holds(derivation, library)]
+        matching = (self.rules[n].matching_parts(derivation, library) for n in numbers)
+        kinds: set[_Item] = {
+            (library.manifest(node.part).kind, node.part) for node in derivation.walk()
+        }
+        own_parts = parts(derivation)
         return _Draft(
             recipe,
             derivation,
-            category,
-            holding,
-            parts(derivation),
-            held_out_parts(self.rules, derivation, self.library),
-            frozenset[str]().union(*matching),
-            by_kind,
+            tuple(numbers),
+            own_parts,
+            own_parts - held_out_parts(self.rules, derivation, library),
+            (
+                [("rule", number) for number in numbers],
+                [("held out", part) for part in frozenset[str]().union(*matching)],
+                [("category", recipe.category)],
+                *([item for item in kinds if item[0] == kind] for kind in STRATA),
+            ),
             hashlib.sha256(f"{self.seed} {derivation}".encode()).hexdigest(),
         )
 
@@ -296,9 +298,8 @@ def _from_patterns(
     # The draws take turns between robots, so few values of each are enough, if not too few.
     num_values = min(wanted, 4 + 4 * wanted // max(sum(map(bool, varied)), 1))
     for robot, choices in zip(robots, varied, strict=True):
-        category = category_of(robot.words, maker.library)
-        for derivation in _with_values(robot.derivation, choices, num_values, maker):
-            yield maker.draft(DerivedRecipe(derivation, robot.name, category), derivation, category)
+        for derivation in _with_values(robot.recipe.derivation, choices, num_values, maker):
+            yield maker.draft(replace(robot.recipe, derivation=derivation), derivation)
 
 
 def _from_grammars(
@@ -309,7 +310,7 @@ def _from_grammars(
         for number in range(max(MAX_DRAWS, 4 * (max(request.train) + request.test))):  # many repeat
             derivation = stream.derivation(number, maker.library)
             if derivation is not None:
-                yield maker.draft(stream.recipe(number), derivation, grammar.name)
+                yield maker.draft(stream.recipe(number), derivation)
 
 
 @dataclass(frozen=True)
@@ -336,7 +337,7 @@ def _varied(robot: PatternRobot, maker: _DraftMaker) -> list[_Choice]:
     given = {word.partition("=")[0].replace(".", "_") for word in robot.words}
     conditions = [condition for rule in maker.rules for condition in rule.conditions]
     choices: list[_Choice] = []
-    for node in robot.derivation.walk():
+    for node in robot.recipe.derivation.walk():
         manifest = maker.library.manifest(node.part)
         for condition in conditions:
             if condition.bounds is None or not condition.applies_to(manifest):
@@ -386,75 +387,34 @@ def _replace_values(
     return updated(derivation)
 
 
-STRATA = ("arm", "ee", "body", "base")
-"""Kinds of parts whose use is balanced, the most important first. Segments are repeated at will."""
+def _stratified(
+    drafts: Mapping[int, _Draft], n: int, needed: frozenset[str] = frozenset()
+) -> list[int]:
+    """Return the numbers of up to n drafts, each the best one after those before it.
 
-_Key: TypeAlias = tuple[int, ...]
-_Item: TypeAlias = tuple[str, object]
+    It is the one whose strata occur least among those; of several, the one with most of the needed
+    parts that those lack.
+    """
+    counts: Counter[_Item] = Counter()
+    missing = set(needed)
 
+    def key(draft: _Draft) -> _Key:
+        common = (max((counts[item] for item in group), default=0) for group in draft.strata)
+        return (*common, -len(missing & draft.parts))
 
-class _Balance:
-    """How often the parts and categories of the robots chosen so far occur."""
-
-    def __init__(self) -> None:
-        self._counts: Counter[_Item] = Counter()
-
-    def _items(self, draft: _Draft) -> list[list[_Item]]:
-        """Return what is balanced, the most important first; each is an alternative in a group."""
-        groups: list[list[_Item]] = [[("category", draft.category)]]
-        return groups + [
-            [(kind, part) for part in draft.parts_by_kind.get(kind, ())] for kind in STRATA
-        ]
-
-    def key(self, draft: _Draft) -> _Key:
-        """Return how often the items of a robot occur already; the smallest is the best robot."""
-        return tuple(
-            max((self._counts[item] for item in group), default=0) for group in self._items(draft)
-        )
-
-    def add(self, draft: _Draft) -> None:
-        self._counts.update(item for group in self._items(draft) for item in group)
-
-
-class _TestBalance(_Balance):
-    """_Balance the rules, then the parts that they hold for, then all parts."""
-
-    def _items(self, draft: _Draft) -> list[list[_Item]]:
-        rules: list[_Item] = [("rule", number) for number in draft.rules]
-        held: list[_Item] = [("held out", part) for part in draft.matching]
-        return [rules, held, *super()._items(draft)]
-
-
-class _TrainBalance(_Balance):
-    """_Balance the parts; of equally good robots, prefer one with parts that test robots need."""
-
-    def __init__(self, needed: frozenset[str]) -> None:
-        super().__init__()
-        self._needed = set(needed)
-
-    def key(self, draft: _Draft) -> _Key:
-        """Return the key of the balance, then how many needed parts the robot has, negated."""
-        return (*super().key(draft), -len(self._needed & draft.parts))
-
-    def add(self, draft: _Draft) -> None:
-        super().add(draft)
-        self._needed -= draft.parts
-
-
-def _stratified(drafts: Mapping[int, _Draft], n: int, balance: _Balance) -> list[int]:
-    """Return the numbers of up to n drafts, each the best one after those before it."""
     # Keys never become better while robots are chosen, so only the first of the heap is updated.
-    heap = [(balance.key(draft), draft.order, number) for number, draft in drafts.items()]
+    heap = [(key(draft), draft.order, number) for number, draft in drafts.items()]
     heapq.heapify(heap)
     chosen: list[int] = []
     while heap and len(chosen) < n:
-        key, order, number = heapq.heappop(heap)
-        current = balance.key(drafts[number])
-        if current > key:
+        before, order, number = heapq.heappop(heap)
+        draft = drafts[number]
+        if (current := key(draft)) > before:
             heapq.heappush(heap, (current, order, number))
             continue
         chosen.append(number)
-        balance.add(drafts[number])
+        counts.update(item for group in draft.strata for item in group)
+        missing -= draft.parts
     return chosen
 
 
@@ -510,8 +470,7 @@ class _HoldOutSearch:
                 continue
             self.robots[number] = result
             # The conditions of a grammar may have replaced the derivation that was drawn.
-            draft = self.pool[number]
-            self.pool[number] = self.maker.draft(draft.recipe, result.derivation, draft.category)
+            self.pool[number] = self.maker.draft(self.pool[number].recipe, result.derivation)
 
     def _choose(self) -> tuple[list[int], list[int]]:
         """Return the numbers of the best test and train robots that are not rejected."""
@@ -521,9 +480,9 @@ class _HoldOutSearch:
         testable = {
             n: draft for n, draft in drafts.items() if draft.rules and draft.required <= train_parts
         }
-        test = _stratified(testable, self.request.test, _TestBalance())
+        test = _stratified(testable, self.request.test)
         needed = frozenset[str]().union(*(drafts[n].required for n in test))
-        train = _stratified(trainable, max(self.request.train), _TrainBalance(needed))
+        train = _stratified(trainable, max(self.request.train), needed)
         return test, train
 
     def _require_enough(
@@ -595,15 +554,12 @@ class _HoldOutSearch:
         """Reject train robots that the audit would call nearly the same as a test robot."""
         for pair in product(test, train):
             if pair not in self._compared and all(n in self.robots for n in pair):
-                self._compared[pair] = self._is_near(*pair)
+                test_robot, train_robot = (self.robots[n].features for n in pair)
+                assert test_robot is not None
+                assert train_robot is not None
+                self._compared[pair] = is_near(test_robot, train_robot)
             if self._compared.get(pair) and not self.rejected.keys() & set(pair):
                 self.rejected[pair[1]] = "almost the sizes of a test robot"
-
-    def _is_near(self, a: int, b: int) -> bool:
-        x, y = self.robots[a].features, self.robots[b].features
-        assert x is not None
-        assert y is not None
-        return is_near(x, y)
 
 
 _UNNAMED = frozenset(("fixed", NOTHING))

@@ -21,9 +21,9 @@ from morphgen.errors import BenchmarkError, CompositionError, nearest
 from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import MOUNT_YAW
-from morphgen.grammar.request import SLOTS, parse_words
+from morphgen.grammar.request import SLOTS
 from morphgen.model.findings import Finding
-from morphgen.splits.candidates import Candidate
+from morphgen.splits.candidates import Candidate, DerivedRecipe, recipe_of
 from morphgen.splits.split import COMPOSED, Member, Regime, Split
 
 NOTHING = "none"
@@ -37,8 +37,7 @@ class PatternRobot:
     """A robot that a pattern stands for."""
 
     words: tuple[str, ...]  # arguments of `morphgen compose`
-    derivation: Derivation
-    name: str  # name that `morphgen compose` gives it
+    recipe: DerivedRecipe
 
 
 def pattern_robots(pattern: str, library: Library) -> list[PatternRobot]:
@@ -53,7 +52,7 @@ def pattern_robots(pattern: str, library: Library) -> list[PatternRobot]:
         fitting: list[PatternRobot] = []
         for concrete in itertools.product(*choices):
             try:
-                fitting.append(PatternRobot(concrete, *parse_words(concrete, library)))
+                fitting.append(PatternRobot(concrete, recipe_of(concrete, library)))
             except CompositionError as error:
                 if concrete == words:  # named parts must fit; a wildcard means those that do
                     raise

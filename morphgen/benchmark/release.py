@@ -1,4 +1,4 @@
-"""Releases: making, describing and reading them, and access to their archives.
+"""Releases: making, describing, reading and verifying them, and access to their archives.
 
 A release is a split folder (see ``split_folder``) with further files:
 
@@ -15,6 +15,7 @@ An archive is a zip of this folder. The same inputs give the same bytes.
 
 from __future__ import annotations
 
+import csv
 import datetime
 import hashlib
 import json
@@ -22,7 +23,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path, PurePosixPath
@@ -44,12 +45,17 @@ from morphgen.benchmark.licences import (
 )
 from morphgen.benchmark.split_folder import (
     BUNDLED,
+    FITTED_TOLERANCE,
     README_FILE,
     ROBOTS_FILE,
+    SPLIT_FILE,
     SUMS_FILE,
     BuildReport,
     BuildSettings,
+    Difference,
     build_split,
+    compare_folder,
+    compare_robots,
     is_archive,
     read_sums,
     require_split_folder,
@@ -59,18 +65,26 @@ from morphgen.benchmark.split_folder import (
 )
 from morphgen.benchmark.survey import (
     DIGITS,
+    STRUCTURAL,
     BaselineResults,
     RobotDifficulty,
     SplitSurvey,
+    compare_members,
+    different_members,
+    difficulty_cells,
     difficulty_csv,
     difficulty_table,
+    nearest_column,
     summarize_survey,
     survey_difficulty,
     survey_split,
+    train_similarity,
 )
 from morphgen.benchmark.texts import read_text
-from morphgen.errors import BenchmarkError
+from morphgen.encoding.similarity import MEASURES
+from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.data_files import read_json
+from morphgen.formats.data_files import read_text as read_data_text
 from morphgen.formats.files import (
     file_sha256,
     locked_folder,
@@ -82,7 +96,7 @@ from morphgen.formats.records import Record, read_record
 from morphgen.formats.zip_files import ZipLimits, unpack_zip, write_zip
 from morphgen.grammar.library import Library
 from morphgen.splits.split import SIDES, Split, split_id
-from morphgen.splits.split_file import is_split_name
+from morphgen.splits.split_file import find_split, is_split_name, read_split_file
 from morphgen.tasks.goals.split_goals import (
     GOALS,
     GoalResult,
@@ -92,6 +106,7 @@ from morphgen.tasks.goals.split_goals import (
     sample_split_goals,
 )
 from morphgen.tasks.scenes.env_specs import GoalConfig
+from morphgen.typing import Array
 
 RELEASE_FILE = "release.json"
 LICENCES_FILE, LICENCES_TEXT = "licences.json", "LICENCES.md"
@@ -557,3 +572,128 @@ def _write_archive(folder: Path, out: Path, release: Release) -> ReleaseReport:
         made.replace(archive)
     content = file_sha256(folder / SUMS_FILE)
     return ReleaseReport(archive, digest, content, len(files), archive.stat().st_size, release)
+
+
+_MAX_SHOWN = 100  # largest number of characters of a cell in a message
+_NUMBERS = ("reach", *MEASURES)  # columns that are compared with `FITTED_TOLERANCE`
+_NEAREST = {nearest_column(name): name for name in MEASURES}
+"""Measure by the column of its nearest train robot."""
+
+
+def _release_differences(folder: Path, split: Split, library: Library) -> Iterator[Difference]:
+    """Yield what a release states otherwise than its split."""
+    try:
+        release = read_release(folder)
+        if (release.name, release.id) != (split.name, split_id(split)):
+            why = f"it is of split {release.name}, id {release.id}, not of {SPLIT_FILE}"
+            yield Difference(RELEASE_FILE, why)
+        expected = [part.as_dict() for part in licenced_parts(split, library)]
+        if _without_sources(read_json(folder / LICENCES_FILE)) != _without_sources(expected):
+            yield Difference(LICENCES_FILE, "its licences are not those of the parts")
+    except MorphgenError as error:
+        yield Difference(RELEASE_FILE, str(error))
+
+
+def _without_sources(parts: Any) -> list[Any]:  # noqa: ANN401
+    """Return the content of ``licences.json`` without texts that a new version may word anew."""
+    entries = parts if isinstance(parts, list) else [parts]
+    return [
+        {key: entry[key] for key in entry if key != "source"} if isinstance(entry, dict) else entry
+        for entry in entries
+    ]
+
+
+def _difficulty_differences(path: Path, survey: SplitSurvey) -> Iterator[str]:
+    """Yield how the structural columns of ``difficulty.csv`` differ from those of a survey."""
+    try:
+        header, *lines = csv.reader(read_data_text(path).splitlines() or [""])
+    except (MorphgenError, csv.Error) as error:
+        yield f"cannot be read: {error}"
+        return
+    if tuple(header[: len(STRUCTURAL)]) != STRUCTURAL:
+        yield f"it has other columns; expected {', '.join(STRUCTURAL)}"
+        return
+    rows = survey_difficulty(survey)
+    if len(lines) != len(rows):
+        yield f"it has {len(lines)} robots, not {len(rows)}"
+        return
+    names = [member.name for member in survey.split.train]
+    for i, (cells, row) in enumerate(zip(lines, rows, strict=True)):
+        if len(cells) != len(header):
+            yield f"line {i + 2} has {len(cells)} cells, not {len(header)}"
+            continue
+        line = dict(zip(header, cells, strict=True))
+        similarity = dict(zip(names, train_similarity(survey, i), strict=True))
+        for why in _row_differences(line, row, similarity):
+            yield f"line {i + 2}: {why}"
+
+
+def _row_differences(
+    line: Mapping[str, str], row: RobotDifficulty, similarity: Mapping[str, Array]
+) -> Iterator[str]:
+    """Yield how a line differs from a robot's row, given its similarity to every train robot."""
+    cells = difficulty_cells(row)
+    for column in STRUCTURAL:
+        found, expected = line[column], cells.get(column, "")
+        if found == expected:
+            continue
+        with suppress(ValueError):  # of a cell that is no number
+            if column in _NUMBERS and abs(float(found) - float(expected)) <= FITTED_TOLERANCE:
+                continue
+        if column in _NEAREST and found in similarity:
+            # Of nearly equal train robots another one may be the nearest on another machine.
+            measure, value = _NEAREST[column], similarity[found]
+            best = row.nearest.get(measure)
+            if best and abs(value[tuple(MEASURES).index(measure)] - best.value) <= FITTED_TOLERANCE:
+                continue
+        yield f"{column} of {row.robot} is {found[:_MAX_SHOWN]!r}, not {expected!r}"
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Result of a verification."""
+
+    split: Split
+    id: str  # id of the split, computed from its robots
+    differences: tuple[Difference, ...]
+    content: str = ""  # for a release: SHA-256 of `SHA256SUMS`, which lists all files
+
+
+def verify(name_or_path: str | Path, library: Library, *, jobs: int = 1) -> Verification:
+    """Compare a split with the robots that its derivations give today.
+
+    The id of the split and the hash of each robot are tested. In a split folder every file is
+    compared with ``SHA256SUMS`` and with the robot that its derivation gives, too; in a release
+    also its description, its licences and its difficulty.
+    """
+    folder = Path(name_or_path)
+    if is_archive(folder):
+        with opened_folder(folder) as unpacked:
+            return verify(unpacked, library, jobs=jobs)
+    is_built = folder.is_dir()
+    if is_built:
+        require_split_folder(folder)
+    path = folder / SPLIT_FILE if is_built else find_split(name_or_path)
+    split_file = read_split_file(path)
+    split, computed_id = split_file.split, split_id(split_file.split)
+    differences = []
+    if split_file.id != computed_id:
+        why = f"its id is {split_file.id}, but that of its robots is {computed_id}"
+        differences.append(Difference(str(path), why))
+    if not is_built:
+        differences += compare_robots(split, library, jobs=jobs)
+        return Verification(split, computed_id, tuple(differences))
+    difficulty = folder / DIFFICULTY_FILE
+    has_difficulty = is_release(folder) and difficulty.exists()  # version 0.2 wrote none
+    found, robots = compare_folder(folder, split, library, with_features=has_difficulty, jobs=jobs)
+    differences += found
+    if not is_release(folder):
+        return Verification(split, computed_id, tuple(differences))
+    differences += _release_differences(folder, split, library)
+    if has_difficulty and robots:
+        known = [robots[member.robot_hash] for member in different_members(split)]
+        survey = compare_members(split, known, "train", jobs=jobs)
+        faults = _difficulty_differences(difficulty, survey)
+        differences += [Difference(DIFFICULTY_FILE, why) for why in faults]
+    content = file_sha256(folder / SUMS_FILE)
+    return Verification(split, computed_id, tuple(differences), content)

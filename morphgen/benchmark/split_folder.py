@@ -1,4 +1,4 @@
-"""Build and read split folders: a split with the files of all its robots.
+"""Build, read and compare split folders: a split with the files of all its robots.
 
 split.yaml         the split
 robots.jsonl       one line per robot, train robots first
@@ -31,18 +31,20 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.survey import robot_stats
+from morphgen.benchmark.survey import SurveyedRobot, measure_robot
 from morphgen.benchmark.texts import read_text as package_text
 from morphgen.checks import check
 from morphgen.encoding.tokens import (
+    GEOMETRY,
+    LAYOUT,
     LAYOUT_ARRAYS,
+    SHAPE_POSE,
     TOKEN_SIZE,
+    TOLERANCE,
     pad_tokens,
     require_max_links,
-    tokens,
 )
-from morphgen.errors import BenchmarkError, FormatError
-from morphgen.fitting.token_shapes import token_shapes
+from morphgen.errors import BenchmarkError, FormatError, MorphgenError
 from morphgen.formats import records
 from morphgen.formats.bundle import (
     CARD,
@@ -228,21 +230,6 @@ class BuildSettings:
 BUNDLED = BuildSettings()
 
 
-@dataclass(frozen=True, eq=False)
-class RobotData:
-    """The measurements and tokens of a robot."""
-
-    facts: Mapping[str, object]
-    """Numbers of links and joints, reach and mass, see ``survey.RobotStats``."""
-    tokens: Array  # tokens, shape (n_links, 48)
-
-
-def robot_data(robot: Robot, library: Library, max_links: int) -> RobotData:
-    """Measure a robot."""
-    table = tokens(robot, token_shapes(robot, library.folders), max_links=max_links)
-    return RobotData(vars(robot_stats(robot)), table)
-
-
 def unique_robots(split: Split) -> list[Member]:
     """Return the first member of each robot, train first; its name is that of the folder."""
     firsts: dict[str, Member] = {}
@@ -262,8 +249,8 @@ def robot_paths(split: Split) -> dict[str, str]:
     return {member.robot_hash: f"{ROBOTS_DIR}/{member.name}" for member in unique_robots(split)}
 
 
-def robot_records(split: Split, known: Mapping[str, RobotData]) -> list[Record]:
-    """Return the lines of ``robots.jsonl``."""
+def robot_records(split: Split, known: Mapping[str, SurveyedRobot]) -> list[Record]:
+    """Return the lines of ``robots.jsonl``, given the robots by their hashes."""
     paths = robot_paths(split)
     return [
         {
@@ -274,21 +261,23 @@ def robot_records(split: Split, known: Mapping[str, RobotData]) -> list[Record]:
             "category": member.category,
             "derivation": member.derivation,
             "hash": member.robot_hash,
-            **known[member.robot_hash].facts,
+            **vars(known[member.robot_hash].stats),
             "path": paths[member.robot_hash],
         }
         for side, member in sided_members(split)
     ]
 
 
-def token_tables(split: Split, known: Mapping[str, RobotData]) -> tuple[Array, NDArray[np.bool_]]:
+def token_tables(
+    split: Split, known: Mapping[str, SurveyedRobot]
+) -> tuple[Array, NDArray[np.bool_]]:
     """Return tokens (n, max_links, 48) and mask (n, max_links) of all members."""
     tables = [known[member.robot_hash].tokens for _, member in sided_members(split)]
     padded = [pad_tokens(table, split.max_links) for table in tables]
     return np.array([table for table, _ in padded]), np.array([mask for _, mask in padded])
 
 
-def tokens_npz(split: Split, known: Mapping[str, RobotData]) -> bytes:
+def tokens_npz(split: Split, known: Mapping[str, SurveyedRobot]) -> bytes:
     """Return the bytes of ``tokens.npz``."""
     tables, mask = token_tables(split, known)
     content = io.BytesIO()
@@ -327,14 +316,6 @@ _REL_TOL, _ABS_TOL = 1e-6, 1e-9
 """Tolerances of the numbers of two cards, which may be rounded on different machines."""
 
 
-def write_robot(robot: Robot, folder: Path, *, light: bool, picture: bool) -> None:
-    """Write a robot's bundle over an existing folder; ``light``: only URDF and derivation."""
-    if light:
-        write_light(robot, folder)
-        return
-    write_bundle(robot, folder, check(robot), picture=picture, edits_kept=False)
-
-
 def differences(folder: Path, robot: Robot, *, light: bool) -> list[str]:
     """Return the differences between a robot's folder and the robot, one line each.
 
@@ -344,15 +325,6 @@ def differences(folder: Path, robot: Robot, *, light: bool) -> list[str]:
     if not folder.is_dir():
         return ["its folder is missing"]
     return list(_light_differences(folder, robot) if light else _differences(folder, robot))
-
-
-def is_current(folder: Path, *, light: bool, picture: bool) -> bool:
-    """Test if this version of morphgen would write a folder without differences in the same way."""
-    if light:
-        return True
-    card = read_json(folder / CARD)
-    has_picture = (folder / PICTURE).is_file()
-    return card["versions"] == {"morphgen": version("morphgen")} and has_picture == picture
 
 
 def _light_differences(folder: Path, robot: Robot) -> Iterator[str]:
@@ -436,7 +408,7 @@ def build_split(
             results = parallel_map(write, members, jobs)
             robots = {member.robot_hash: r for member, r in zip(members, results, strict=True)}
             _finish(split_folder, split, settings, robots)
-    num_written = sum(robot.is_new for robot in robots.values())
+    num_written = sum(is_new for is_new, _, _ in robots.values())
     return BuildReport(split_folder, num_written, len(robots) - num_written)
 
 
@@ -447,13 +419,8 @@ def split_folder_path(split: Split, folder: Path) -> Path:
     return folder
 
 
-@dataclass(frozen=True, eq=False)
-class _WrittenRobot:
-    """A robot that was written or kept."""
-
-    is_new: bool
-    data: RobotData
-    hashes: dict[str, str]
+_WrittenRobot = tuple[bool, SurveyedRobot, dict[str, str]]
+"""Whether a robot's folder was written, the robot, and the hashes of its files by name."""
 
 
 def _write_member(
@@ -463,13 +430,17 @@ def _write_member(
     robot = compose_member(member, library)
     require_max_links(len(robot.links), f"robot {member.name!r}", max_links)
     folder = bundle_folder(split_folder / ROBOTS_DIR, member.name)
-    light, picture = settings.light, settings.picture
-    is_kept = not differences(folder, robot, light=light) and is_current(
-        folder, light=light, picture=picture
-    )
-    if not is_kept:
-        write_robot(robot, folder, light=light, picture=picture)
-    return _WrittenRobot(not is_kept, robot_data(robot, library, max_links), folder_hashes(folder))
+    is_kept = not differences(folder, robot, light=settings.light)
+    if is_kept and not settings.light:  # written in the same way by this version
+        versions = read_json(folder / CARD)["versions"]
+        has_picture = (folder / PICTURE).is_file()
+        is_kept = versions == {"morphgen": version("morphgen")} and has_picture == settings.picture
+    if not is_kept and settings.light:
+        write_light(robot, folder)
+    elif not is_kept:
+        write_bundle(robot, folder, check(robot), picture=settings.picture, edits_kept=False)
+    measured = measure_robot(robot, library, max_links, with_features=False)
+    return not is_kept, measured, folder_hashes(folder)
 
 
 def _prepare(split_folder: Path, split: Split, settings: BuildSettings) -> None:
@@ -501,7 +472,7 @@ def _finish(
     split_folder: Path, split: Split, settings: BuildSettings, robots: Mapping[str, _WrittenRobot]
 ) -> None:
     """Write the files of the whole split, the hashes last."""
-    known = {robot_hash: robot.data for robot_hash, robot in robots.items()}
+    known = {robot_hash: measured for robot_hash, (_, measured, _) in robots.items()}
     lines = (json.dumps(record, ensure_ascii=False) for record in robot_records(split, known))
     write_atomic(split_folder / ROBOTS_FILE, "".join(f"{line}\n" for line in lines))
     write_atomic(split_folder / TOKENS_FILE, tokens_npz(split, known))
@@ -509,8 +480,8 @@ def _finish(
     single = (README_FILE, ROBOTS_FILE, BUILD_FILE, SPLIT_FILE, TOKENS_FILE)
     sums = {name: file_sha256(split_folder / name) for name in single}
     paths = robot_paths(split)
-    for robot_hash, robot in robots.items():
-        sums |= {f"{paths[robot_hash]}/{name}": value for name, value in robot.hashes.items()}
+    for robot_hash, (_, _, hashes) in robots.items():
+        sums |= {f"{paths[robot_hash]}/{name}": value for name, value in hashes.items()}
     write_atomic(split_folder / SUMS_FILE, sums_text(sums))
 
 
@@ -551,3 +522,175 @@ def read_split_or_folder(name: str | PathLike[str]) -> tuple[Split, Path | None]
         return read_split(str(name)), None
     require_split_folder(folder)
     return read_split(folder / SPLIT_FILE), folder
+
+
+FITTED_TOLERANCE = 1e-3
+"""Tolerance of what depends on primitives that may be fitted on this machine: the token numbers of
+a link's primitive, the reach [m] and similarities."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One difference between a split and its robots."""
+
+    where: str  # name of the robot, or of a file
+    why: str
+
+
+def require_unchanged(folder: Path, name: str) -> None:
+    """Require that the files of a split folder are those that ``SHA256SUMS`` lists."""
+    changed = list(_file_differences(folder))
+    if changed:
+        more = f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
+        first = f"{changed[0].where}: {changed[0].why}"
+        raise BenchmarkError(f"{name}: {first}{more}; get it again, or see morphgen split verify")
+
+
+def compare_robots(split: Split, library: Library, *, jobs: int = 1) -> tuple[Difference, ...]:
+    """Compose every robot of a split and compare its hash; see ``verify``."""
+    return tuple(_robot_differences(split, _inspect(split, library, None, jobs)))
+
+
+_Inspection = tuple[list[str], SurveyedRobot | None]
+"""The differences of a robot and, in a split folder, the robot."""
+
+
+@dataclass(frozen=True, eq=False)
+class _BuiltFolder:
+    """A split folder whose robots are compared."""
+
+    path: Path
+    light: bool
+    with_features: bool  # whether the robots get features
+    robot_paths: Mapping[str, str]  # folder of each robot by its hash
+
+
+def _inspect_member(
+    library: Library, max_links: int, built: _BuiltFolder | None, member: Member
+) -> _Inspection:
+    """Compose a member, and compare it with its folder; runs in worker processes."""
+    try:
+        robot = compose_member(member, library)
+        if built is None:
+            return [], None
+        folder = built.path / built.robot_paths[member.robot_hash]
+        # Members with the same robot share the folder of the first one, which is compared.
+        is_first = folder.name == member.name
+        lines = differences(folder, robot, light=built.light) if is_first else []
+        return lines, measure_robot(robot, library, max_links, with_features=built.with_features)
+    except MorphgenError as error:
+        return [str(error)], None
+
+
+def _inspect(
+    split: Split, library: Library, built: _BuiltFolder | None, jobs: int
+) -> dict[tuple[str, str], _Inspection]:
+    """Inspect each different robot once; return the results by derivation and hash."""
+    members = [member for _, member in reversed(sided_members(split))]  # the first one stays last
+    firsts = {(member.derivation, member.robot_hash): member for member in members}
+    inspect = partial(_inspect_member, library, split.max_links, built)
+    return dict(zip(firsts, parallel_map(inspect, list(firsts.values()), jobs), strict=True))
+
+
+def _robot_differences(
+    split: Split, inspected: Mapping[tuple[str, str], _Inspection]
+) -> Iterator[Difference]:
+    for _, member in sided_members(split):
+        for why in inspected[member.derivation, member.robot_hash][0]:
+            yield Difference(member.name, why)
+
+
+def compare_folder(
+    folder: Path, split: Split, library: Library, *, with_features: bool, jobs: int
+) -> tuple[list[Difference], Mapping[str, SurveyedRobot]]:
+    """Compare the files of a split folder with ``SHA256SUMS`` and with the robots of its split.
+
+    Returns also the robots by hash, or none if one of them cannot be composed.
+    """
+    build, found = read_settings(folder / BUILD_FILE), list[Difference]()
+    if build.split != split_id(split):
+        why = f"it is of split {build.split}, not of {SPLIT_FILE}"
+        found.append(Difference(BUILD_FILE, why))
+    try:
+        paths = robot_paths(split)
+    except BenchmarkError as error:
+        return [*found, Difference(SPLIT_FILE, str(error))], {}
+    files = list(_file_differences(folder))
+    built = _BuiltFolder(folder, build.light, with_features, paths)
+    inspected = _inspect(split, library, built, jobs)
+    # A changed file explains the differences of its robot.
+    explained = {difference.where for difference in files}
+    robots = _robot_differences(split, inspected)
+    found += [*files, *(each for each in robots if each.where not in explained)]
+    known = {
+        robot_hash: robot for (_, robot_hash), (_, robot) in inspected.items() if robot is not None
+    }
+    if not known.keys() >= paths.keys():
+        return found, {}
+    for name, compare in ((ROBOTS_FILE, _record_differences), (TOKENS_FILE, _token_differences)):
+        try:
+            found += compare(folder / name, split, known)
+        except MorphgenError as error:
+            found.append(Difference(name, str(error)))
+    return found, known
+
+
+def _file_differences(folder: Path) -> Iterator[Difference]:
+    """Yield files that differ from ``SHA256SUMS``; a file of a robot is listed under its name."""
+    expected = read_sums(folder / SUMS_FILE)
+    actual = folder_hashes(folder)
+    for name in sorted((expected.keys() | actual.keys()) - {SUMS_FILE}):
+        if name not in actual:
+            why = f"is missing, but {SUMS_FILE} names it"
+        elif name not in expected:
+            why = f"is not named by {SUMS_FILE}"
+        elif actual[name] != expected[name]:
+            why = f"is not what {SUMS_FILE} was written for"
+        else:
+            continue
+        parent, _, rest = name.partition("/")
+        robot, _, file = rest.partition("/")
+        where, path = (robot, file) if parent == ROBOTS_DIR and file else (name, name)
+        yield Difference(where, f"file {path} {why}")
+
+
+def _record_differences(
+    path: Path, split: Split, known: Mapping[str, SurveyedRobot]
+) -> Iterator[Difference]:
+    """Yield entries of ``robots.jsonl`` that differ from the robots."""
+    stored, expected = read_records(path), robot_records(split, known)
+    if len(stored) != len(expected):
+        yield Difference(path.name, f"it has {len(stored)} robots, not {len(expected)}")
+        return
+    for i, (line, computed) in enumerate(zip(stored, expected, strict=True), 1):
+        keys = sorted(line.keys() | computed.keys())
+        wrong = [key for key in keys if not same(line.get(key), computed.get(key))]
+        for key in wrong:
+            why = f"{path.name}:{i}: {key} is {line.get(key)!r}, not {computed.get(key)!r}"
+            yield Difference(str(computed["name"]), why)
+
+
+def _token_differences(
+    path: Path, split: Split, known: Mapping[str, SurveyedRobot]
+) -> Iterator[Difference]:
+    """Yield robots whose rows of ``tokens.npz`` differ from their tokens."""
+    names, tokens, mask = read_tokens(path)
+    computed, computed_mask = token_tables(split, known)
+    expected = [member.name for _, member in sided_members(split)]
+    if names != expected or tokens.shape != computed.shape:
+        yield Difference(path.name, f"it is not of the {len(expected)} robots of {SPLIT_FILE}")
+        return
+    # Primitives of meshes are fitted here, in the last bits otherwise than where it was built.
+    errors = np.abs(tokens - computed)
+    for shape in (GEOMETRY, SHAPE_POSE):
+        errors[..., shape.columns] *= TOLERANCE / FITTED_TOLERANCE
+    for i, name in enumerate(expected):
+        if (mask[i] != computed_mask[i]).any():
+            yield Difference(name, f"{path.name}: its mask is not that of its links")
+        wrong = ~(errors[i] <= TOLERANCE)  # NaN is wrong, too
+        if wrong.any():
+            link, column = np.argwhere(wrong)[0].tolist()
+            token_field = next(entry for entry in LAYOUT if column < entry.columns.stop)
+            yield Difference(
+                name, f"{path.name}: {token_field.name} of link {link} is not the robot's"
+            )

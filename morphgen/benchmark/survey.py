@@ -10,7 +10,7 @@ import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import yaml
@@ -20,6 +20,7 @@ from tabulate import tabulate
 from morphgen.benchmark.texts import read_text
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.encoding.similarity import MEASURES, Features, features, most_alike
+from morphgen.encoding.tokens import tokens
 from morphgen.errors import BenchmarkError, MorphgenError, nearest
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.rounding import round_number
@@ -62,8 +63,9 @@ class SurveyedRobot:
 
     robot_hash: str  # hash of the robot; see `morphgen.encoding.robot_hash`
     stats: RobotStats
-    features: Features = field(compare=False, repr=False)
-    """Features of the robot, which the similarity measures compare."""
+    tokens: Array = field(compare=False, repr=False)  # tokens at home, shape (n_links, 48)
+    features: Features | None = field(compare=False, repr=False)
+    """Features of the robot, which the similarity measures compare; None if none is asked for."""
 
 
 Pairs = Literal["sides", "train", "all"]
@@ -89,6 +91,11 @@ class SplitSurvey:
     def test(self) -> tuple[SurveyedRobot | Fault, ...]:
         """The test robots."""
         return self.robots[len(self.split.train) :]
+
+    @property
+    def features(self) -> tuple[Features | None, ...]:
+        """The features of the robots, None of those with a fault."""
+        return tuple(None if isinstance(each, Fault) else each.features for each in self.robots)
 
     def by_measure(self, measure: str) -> Array:
         """Return the similarity of train and test robots, shape (n_train, n_test)."""
@@ -119,6 +126,16 @@ def robot_stats(robot: Robot) -> RobotStats:
     )
 
 
+def measure_robot(
+    robot: Robot, library: Library, max_links: int, *, with_features: bool
+) -> SurveyedRobot:
+    """Measure a robot as its split states it."""
+    shapes = token_shapes(robot, library.folders)
+    table = tokens(robot, shapes, max_links=max_links)
+    found = features(robot, shapes, max_links=max_links) if with_features else None
+    return SurveyedRobot(robot_hash(robot), robot_stats(robot), table, found)
+
+
 def survey_robot(library: Library, max_links: int, member: Member) -> SurveyedRobot | Fault:
     """Compose and measure a robot."""
     try:
@@ -131,8 +148,7 @@ def survey_robot(library: Library, max_links: int, member: Member) -> SurveyedRo
         if len(robot.links) > max_links:
             why = f"it has {len(robot.links)} links, more than max_links {max_links}"
             return Fault("links-many", why)
-        found = features(robot, token_shapes(robot, library.folders), max_links=max_links)
-        return SurveyedRobot(robot_hash(robot), robot_stats(robot), found)
+        return measure_robot(robot, library, max_links, with_features=True)
     except MorphgenError as error:
         return Fault("body-broken", str(error))
 
@@ -240,15 +256,8 @@ def _side(survey: SplitSurvey, side: Side) -> dict[str, object]:
 PAPER_TABLE = "AnyBody (arXiv 2505.14986), table 'Statistics about benchmark tasks'"
 
 
-@dataclass(frozen=True)
-class PaperRow:
-    """A row of the paper's table: means over the train robots."""
-
-    title: str  # name of the set of robots in the paper
-    links: float
-    movable: float  # movable joints
-    movable_to_tool: float | None  # movable joints between root and tool; None for the paper's dash
-    cosine: float  # cosine similarity, over pairs of a test and a train robot
+PaperRow: TypeAlias = Mapping[str, Any]
+"""A row of the paper's table: means over the train robots, under the keys of ``paper.yaml``."""
 
 
 def paper_row(split: str) -> PaperRow | None:
@@ -257,9 +266,10 @@ def paper_row(split: str) -> PaperRow | None:
 
 
 @cache
-def paper_rows() -> Mapping[str, PaperRow]:
+def paper_rows() -> dict[str, PaperRow]:
     """Return the paper's rows by set of robots, which is a scenario's name without its task."""
-    return {key: PaperRow(**row) for key, row in yaml.safe_load(read_text("paper.yaml")).items()}
+    rows: dict[str, PaperRow] = yaml.safe_load(read_text("paper.yaml"))
+    return rows
 
 
 DIFFICULTY_DIGITS = 6

@@ -7,7 +7,6 @@ import itertools
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -16,10 +15,9 @@ from tabulate import tabulate
 
 from morphgen.api.splits import NewSplit
 from morphgen.api.splits import split as choose
-from morphgen.benchmark import verify as verification
-from morphgen.benchmark.audit import Audit
+from morphgen.benchmark import release as releases
+from morphgen.benchmark.audit import Audit, audit_goals, goals_to_audit, with_goal_findings
 from morphgen.benchmark.audit import audit as audit_robots
-from morphgen.benchmark.goal_audit import audit_goals, goals_to_audit, with_goal_findings
 from morphgen.benchmark.hold_out import related_parts
 from morphgen.benchmark.licences import (
     licence_lines,
@@ -30,7 +28,7 @@ from morphgen.benchmark.licences import (
 )
 from morphgen.benchmark.release import build_with_goals
 from morphgen.benchmark.scores.results import study_results
-from morphgen.benchmark.split_folder import BuildSettings, read_split_or_folder
+from morphgen.benchmark.split_folder import BuildSettings, Difference, read_split_or_folder
 from morphgen.benchmark.survey import (
     PAPER_TABLE,
     PaperRow,
@@ -41,7 +39,6 @@ from morphgen.benchmark.survey import (
     split_difficulty,
     statistics,
 )
-from morphgen.benchmark.verify import Difference
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, status
 from morphgen.encoding.similarity import MEASURES, NEAR_THRESHOLDS, NearThresholds
@@ -254,7 +251,7 @@ def build(args: argparse.Namespace) -> None:
 def verify(args: argparse.Namespace) -> int:
     """Verify a split and print what differs."""
     with bar(args, "verifying"):
-        result = verification.verify(args.path, opt.library_of(args), jobs=args.jobs)
+        result = releases.verify(args.path, opt.library_of(args), jobs=args.jobs)
     differences, split = result.differences, result.split
     data = {
         "split": split.name,
@@ -417,7 +414,7 @@ def stats(args: argparse.Namespace) -> None:
             "robots": title,
             "splits": [split.name for split in splits],
             "ours": statistics_by_title[title],
-            "paper": asdict(theirs) if (theirs := paper_row(title)) else None,
+            "paper": paper_row(title),
             "restricted": [part.as_dict() for part in limits[title]],
         }
         for title, splits in groups.items()
@@ -466,7 +463,7 @@ def _stats_row(
     def with_paper(value: str, key: str) -> str:
         if paper_row is None:
             return value
-        paper = getattr(paper_row, key)
+        paper = paper_row[key]
         return f"{value} ({'-' if paper is None else f'{paper:g}'})"
 
     row = {"robots": title, "train": train["robots"], "test": statistics["test"]["robots"]}

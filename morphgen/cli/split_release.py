@@ -44,9 +44,8 @@ from morphgen.benchmark.scores.submission import (
     read_submissions,
     require_same_random,
 )
-from morphgen.benchmark.split_folder import SPLIT_FILE, BuildSettings, is_archive
+from morphgen.benchmark.split_folder import SPLIT_FILE, BuildSettings, is_archive, require_unchanged
 from morphgen.benchmark.survey import BaselineResults
-from morphgen.benchmark.verify import require_unchanged
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar
 from morphgen.errors import BenchmarkError

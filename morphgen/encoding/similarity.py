@@ -49,7 +49,7 @@ class Workspace:
     reach: float  # largest distance of the tool from the shoulder, the unit of the grid [m]
 
 
-def workspace(robot: Robot, samples: int = SAMPLES) -> Workspace:
+def workspace(robot: Robot) -> Workspace:
     """Sample the tool positions of a robot.
 
     Configurations are drawn uniformly within the limits of the joints that move the tool. The seed
@@ -57,22 +57,22 @@ def workspace(robot: Robot, samples: int = SAMPLES) -> Workspace:
     same arm configurations. Each sample is distributed over the eight nodes around it by trilinear
     weights.
     """
-    points, centre, farthest = _tool_points(robot, samples)
+    points, centre, farthest = _tool_points(robot)
     return Workspace(_density(points / farthest), centre, farthest)
 
 
 def tool_reach(robot: Robot) -> tuple[Vec3, float]:
     """Return the ``shoulder`` and the ``reach`` of a robot's ``workspace``."""
-    _, centre, farthest = _tool_points(robot, SAMPLES)
+    _, centre, farthest = _tool_points(robot)
     return centre, farthest
 
 
-def _tool_points(robot: Robot, samples: int) -> tuple[Array, Vec3, float]:
+def _tool_points(robot: Robot) -> tuple[Array, Vec3, float]:
     """Return tool positions from the shoulder, (3, n), the shoulder and the largest distance."""
     chain = _tool_chain(robot)
     centre = shoulder(robot)
     centred = with_root_at(robot, centre)
-    points = frame_positions(centred, _configurations(centred, chain, samples))
+    points = frame_positions(centred, _configurations(centred, chain))
     farthest = max(reach(centred, TOOL), float(np.sqrt((points * points).sum(axis=0).max())))
     if farthest < _IMMOBILE:
         raise BenchmarkError(
@@ -148,12 +148,12 @@ def _tool_chain(robot: Robot) -> tuple[int, ...]:
     return chain
 
 
-def _configurations(robot: Robot, chain: tuple[int, ...], samples: int) -> Array:
+def _configurations(robot: Robot, chain: tuple[int, ...]) -> Array:
     """Draw uniform positions of the joints that move the tool, (dof, n); zeros for others."""
     moving = [*driving_joints(robot, chain)]
     low, high = joint_limits(robot)[moving].T[..., None]
-    q = np.zeros((robot.dof, samples))
-    q[moving] = low + (high - low) * np.random.default_rng(_SEED).random((len(moving), samples))
+    q = np.zeros((robot.dof, SAMPLES))
+    q[moving] = low + (high - low) * np.random.default_rng(_SEED).random((len(moving), SAMPLES))
     return q
 
 

@@ -30,13 +30,10 @@ class SampledRecipe:
     seed: int
     name: str
 
-
-@dataclass(frozen=True)
-class ComposedRecipe:
-    """A robot given by the arguments of ``morphgen compose``."""
-
-    words: tuple[str, ...]
-    name: str = ""  # name of the robot; by default made of the names of its parts
+    @property
+    def category(self) -> str:
+        """Name of the grammar."""
+        return self.grammar.name
 
 
 @dataclass(frozen=True)
@@ -48,7 +45,16 @@ class DerivedRecipe:
     category: str = COMPOSED
 
 
-Recipe = SampledRecipe | ComposedRecipe | DerivedRecipe
+Recipe = SampledRecipe | DerivedRecipe
+
+
+def recipe_of(words: Sequence[str], library: Library, name: str = "") -> DerivedRecipe:
+    """Return the recipe for the arguments of ``morphgen compose``, which also give a name."""
+    derivation, default_name = parse_words(words, library)
+    # The category is the grammar that the arguments begin with, if they are no parts.
+    is_request = "=" in words[0] or (words[0] in library.paths and words[0] not in grammar_names())
+    category = COMPOSED if is_request else words[0].rpartition("/")[2].removesuffix(".grammar")
+    return DerivedRecipe(derivation, name or default_name, category)
 
 
 class UnfitRobotError(BenchmarkError):
@@ -90,25 +96,15 @@ class RobotFactory:
             sample = sample_robot(
                 recipe.grammar, self.library, recipe.number, seed=recipe.seed, name=recipe.name
             )
-            return self._candidate(sample.robot, sample.derivation, recipe.grammar.name)
-        if isinstance(recipe, DerivedRecipe):
-            return self._composed(
-                recipe.derivation, recipe.name, recipe.category, str(recipe.derivation)
-            )
-        derivation, name = parse_words(recipe.words, self.library)
-        category = category_of(recipe.words, self.library)
-        return self._composed(derivation, recipe.name or name, category, " ".join(recipe.words))
-
-    def _composed(self, derivation: Derivation, name: str, category: str, source: str) -> Candidate:
-        """Make a robot that nothing has checked before; ``source`` names it in messages."""
+            return self._candidate(sample.robot, sample.derivation, recipe.category)
         # Joining parts is fast, and the search for contacts of a composed robot is not.
-        self._require_links(join(derivation, self.library, name))
-        robot = compose(derivation, self.library, name)
+        self._require_links(join(recipe.derivation, self.library, recipe.name))
+        robot = compose(recipe.derivation, self.library, recipe.name)
         for finding in check(robot):
             if finding.severity == "error":
-                text = f"{source}: {finding.code} at {finding.where}: {finding.why}"
+                text = f"{recipe.name}: {finding.code} at {finding.where}: {finding.why}"
                 raise UnfitRobotError(text, f"an error of morphgen check: {finding.code}")
-        return self._candidate(robot, derivation, category)
+        return self._candidate(robot, recipe.derivation, recipe.category)
 
     def _require_links(self, robot: Robot) -> None:
         try:
@@ -128,12 +124,6 @@ class RobotFactory:
             shapes = token_shapes(robot, self.library.folders)
             robot_features = features(robot, shapes, max_links=self.max_links)
         return Candidate(robot.name, category, written, robot_hash(robot), robot_features)
-
-
-def category_of(words: Sequence[str], library: Library) -> str:
-    """Return the grammar that the arguments of ``compose`` begin with, else ``composed``."""
-    is_request = "=" in words[0] or (words[0] in library.paths and words[0] not in grammar_names())
-    return COMPOSED if is_request else words[0].rpartition("/")[2].removesuffix(".grammar")
 
 
 def numbered_name(prefix: str, number: int) -> str:

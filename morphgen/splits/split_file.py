@@ -200,22 +200,13 @@ def _shipped() -> Path:
 
 def _block(key: str, value: Mapping[str, object]) -> str:
     text: str = yaml.safe_dump(
-        {key: _plain_data(value)},
+        {key: msgspec.to_builtins(dict(value))},  # YAML writes tuples as lists
         sort_keys=False,
         allow_unicode=True,
         width=10_000,
         default_flow_style=False if key == "accepted" else None,
     )
     return text
-
-
-def _plain_data(value: object) -> object:
-    """Convert mappings and sequences of any type to dictionaries and lists."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain_data(entry) for key, entry in value.items()}
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain_data(entry) for entry in value]
-    return value
 
 
 def _member_line(member: Member) -> str:

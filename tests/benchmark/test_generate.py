@@ -38,7 +38,7 @@ from morphgen.grammar.request import parse_words
 from morphgen.model.findings import Finding
 from morphgen.progress import show_progress
 from morphgen.splits import candidates
-from morphgen.splits.candidates import ComposedRecipe, RobotFactory, SampledRecipe
+from morphgen.splits.candidates import RobotFactory, SampledRecipe, recipe_of
 from morphgen.splits.split import Member, Split, compose_member
 
 
@@ -265,7 +265,7 @@ def test_invalid_orders_are_errors(sizes, changes, message):
 
 def test_robots_are_built_from_the_rounded_numbers_of_their_derivation():
     """The default of the base has 16 digits; the hash is that of the printed derivation."""
-    body = RobotFactory(LIBRARY)(ComposedRecipe(("base=planar", "ee=cube")))
+    body = RobotFactory(LIBRARY)(recipe_of(("base=planar", "ee=cube"), LIBRARY))
     assert "travel_yaw=3.14159265359" in str(body.derivation)
     assert dict(body.derivation.parameters)["travel_yaw"] == 3.14159265359
     robot_grammar = grammar("robot -> planar ee", "ee -> cube(size=uniform(0.05, 0.1))")
@@ -277,8 +277,8 @@ def test_robots_are_built_from_the_rounded_numbers_of_their_derivation():
 def test_a_robot_that_fails_its_checks_is_an_error(monkeypatch):
     findings = [Finding("overlap", "error", "link a", "too deep", "move it")]
     monkeypatch.setattr(candidates, "check", lambda robot: findings)
-    with pytest.raises(BenchmarkError, match="base=gantry ee=cube: overlap at link a: too deep"):
-        RobotFactory(LIBRARY)(ComposedRecipe(("base=gantry", "ee=cube")))
+    with pytest.raises(BenchmarkError, match="gantry-cube: overlap at link a: too deep"):
+        RobotFactory(LIBRARY)(recipe_of(("base=gantry", "ee=cube"), LIBRARY))
 
 
 def derivation(words):

@@ -8,7 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.generated_splits import LIBRARY, derivations, names, order, require_sound
-from morphgen.benchmark.generate import HoldOutCandidate, composition, hold_out, num_covering
+from morphgen.benchmark.generate import (
+    HoldOutCandidate,
+    composition,
+    hold_out_combinations,
+    num_covering,
+)
 from morphgen.benchmark.regimes import expand, parts, regime_findings, structure
 from morphgen.errors import BenchmarkError, CompositionError, PartError
 from morphgen.grammar.derivation import parse_derivation
@@ -120,7 +125,7 @@ def cell(arm, ee, task="reach", k=""):
 
 
 def chosen(cells, n=1, left=1, seed=0):
-    return hold_out(cells, n, left, np.random.SeedSequence(seed))
+    return hold_out_combinations(cells, n, left, np.random.SeedSequence(seed))
 
 
 def is_fair(cells, test, left):

@@ -6,9 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from helpers.caching import once
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
-from morphgen.benchmark.audit import audit
-from morphgen.benchmark.goal_audit import NEAR, audit_goals, with_goal_findings
+from morphgen.benchmark import audit as audit_module
+from morphgen.benchmark.audit import NEAR, audit, audit_goals, with_goal_findings
+from morphgen.encoding.robot_hash import robot_hash
 from morphgen.model.geometry import Pose
 from morphgen.tasks.goals.split_goals import SplitGoals, sample_split_goals
 from morphgen.tasks.push.config import PushConfig
@@ -19,6 +21,18 @@ RECIPE = GoalConfig(0, (ReachConfig(num_goals=12), PushConfig(num_goals=4)))
 REACH = "train", "gantry-plane"
 PUSH = "train", "gantry-cylinder"
 LAST = "test", "planar-plane"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _sets_are_sampled_anew_once():
+    """Each audit compares the sets of a few robots with those that it samples anew."""
+
+    def key(robot, task, config, **options):
+        return robot.name, robot_hash(robot), task, config, *options.items()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(audit_module, "env_spec", once(audit_module.env_spec, key))
+        yield
 
 
 def some(**more):

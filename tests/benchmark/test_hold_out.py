@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import pytest
 
+from helpers.caching import once
 from helpers.generated_splits import LIBRARY, order
 from helpers.grammars import grammar, shipped
 from helpers.splits import member, split
+from morphgen.benchmark import survey
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.hold_out import (
     held_out_parts,
@@ -30,6 +32,17 @@ ARMS = ("arm3", "arm5", "arm_ed", "lwr")
 EES = ("cube", "cylinder", "plane", "sphere", "stick")
 PRIMITIVE = f"arm={{{','.join(ARMS)}}} ee={{{','.join(EES)}}}"
 """Twenty robots without meshes, which are fast to compose."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _robots_are_composed_once():
+    """Most tests draw from the same twenty robots."""
+    with pytest.MonkeyPatch.context() as patch:
+        make = once(RobotFactory.__call__, lambda self, recipe: (self.max_links, repr(recipe)))
+        patch.setattr(RobotFactory, "__call__", make)
+        measure = once(survey.survey_robot, lambda _, max_links, member: (max_links, member))
+        patch.setattr(survey, "survey_robot", measure)
+        yield
 
 
 def made(rules, *train, patterns=(PRIMITIVE,), grammars=(), **changes):
@@ -360,7 +373,7 @@ def test_an_invalid_rule_is_an_error_that_names_it(text, message):
 
 
 def test_a_wildcard_stands_for_the_parts_that_fit():
-    names = [each.name for each in pattern_robots("arm={lwr,yumi*} ee=pl*", LIBRARY)]
+    names = [each.recipe.name for each in pattern_robots("arm={lwr,yumi*} ee=pl*", LIBRARY)]
     assert names == ["lwr-plane", "yumi_left-plane", "yumi_right-plane"]
     assert len(pattern_robots("arm=lwr ee=*", LIBRARY)) == len(LIBRARY.names("ee")) - 1
     with pytest.raises(CompositionError, match="'yumi' has no port 'flange'"):

@@ -19,7 +19,7 @@ from morphgen.errors import BenchmarkError
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import pin
-from morphgen.splits.candidates import ComposedRecipe, RobotFactory, SampledRecipe, members
+from morphgen.splits.candidates import RobotFactory, SampledRecipe, members, recipe_of
 from morphgen.splits.split import SIDES
 from morphgen.splits.split_file import find_split, read_split, split_names, split_text
 
@@ -50,7 +50,7 @@ def generated(split, side):
         for number in range(row.get("first", 0), row.get("first", 0) + row.get("robots", 1)):
             member = next(stored)
             if "words" in row:
-                recipe = ComposedRecipe(tuple(row["words"].split()), row["robot"])
+                recipe = recipe_of(tuple(row["words"].split()), LIBRARY, row["robot"])
             else:
                 loaded = load_grammar(find_grammar(row["grammar"], folders), folders)
                 pinned = pin(loaded, row.get("pinned", "").split(), LIBRARY)

@@ -132,10 +132,9 @@ def test_a_robot_listed_twice_is_written_once(tmp_path):
     assert robots["twin"]["task"] == "reach"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "settings",
-    [pytest.param(BuildSettings(picture=True), marks=pytest.mark.slow), LIGHT],
-    ids=["pictures", "light"],
+    "settings", [BuildSettings(picture=True), LIGHT], ids=["pictures", "light"]
 )
 def test_repeated_and_parallel_builds_have_the_same_bytes(tmp_path, settings):
     cubes = [

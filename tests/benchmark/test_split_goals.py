@@ -16,9 +16,8 @@ from helpers.commands import tree
 from helpers.scenes import robot
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
 from morphgen.benchmark import release
-from morphgen.benchmark.release import write_goals
+from morphgen.benchmark.release import verify, write_goals
 from morphgen.benchmark.split_folder import BuildSettings, build_split, load_split_folder
-from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError, MorphgenError, TaskError
 from morphgen.grammar.library import default_library
 from morphgen.progress import show_progress
@@ -134,6 +133,7 @@ def test_every_member_has_a_set_in_train_test_order(cache, monkeypatch):
     assert sample_sets(mixed(), cache, certified=True)[0].certificate_errors == (line,)
 
 
+@pytest.mark.slow
 def test_sets_drawn_in_several_processes_are_the_same_bytes(tmp_path):
     here, there = (
         [set_npz(one.goals) for one in sample_sets(mixed(), tmp_path / str(jobs), jobs=jobs)]

@@ -12,7 +12,6 @@ import yaml
 from helpers.commands import tree
 from helpers.splits import TEST, TRAIN, combined, member
 from morphgen.benchmark import release as release_module
-from morphgen.benchmark import verify as release_checks
 from morphgen.benchmark.eval_protocol import EvalProtocol
 from morphgen.benchmark.release import (
     CROISSANT_FILE,
@@ -23,6 +22,7 @@ from morphgen.benchmark.release import (
     opened_folder,
     read_release,
     release_split,
+    verify,
 )
 from morphgen.benchmark.split_folder import (
     SUMS_FILE,
@@ -32,7 +32,6 @@ from morphgen.benchmark.split_folder import (
     sums_text,
 )
 from morphgen.benchmark.survey import BaselineResult, difficulty_csv, split_difficulty
-from morphgen.benchmark.verify import verify
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.zip_files import ZipLimits, unpack_zip
 from morphgen.grammar.library import default_library
@@ -169,7 +168,7 @@ def test_verify_accepts_another_nearest_robot_that_is_as_near_up_to_rounding(fol
     pattern = r"(planar-plane,push,.*)planar-cube,[\d.]+$"
     change_difficulty(folder, lambda text: re.sub(pattern, r"\1gantry-cylinder,0.75", text))
     assert len(verify(folder, LIBRARY).differences) == 2
-    monkeypatch.setattr(release_checks, "FITTED_TOLERANCE", 1.0)
+    monkeypatch.setattr(release_module, "FITTED_TOLERANCE", 1.0)
     assert verify(folder, LIBRARY).differences == ()
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from helpers.splits import LIBRARY, TRAIN, combined, member, split
+from morphgen.benchmark.release import verify
 from morphgen.benchmark.split_folder import build_split
-from morphgen.benchmark.verify import verify
 from morphgen.encoding.tokens import GEOMETRY, ORIGIN, PARENT
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.progress import show_progress
