@@ -1,4 +1,4 @@
-"""Comparison of robots: joints with the same role, similarity, and quality of their primitives."""
+"""Comparison of robots: joints with the same role, and similarity."""
 
 from __future__ import annotations
 
@@ -12,21 +12,13 @@ import numpy as np
 from morphgen.encoding.similarity import MEASURES, features, similarity_matrix
 from morphgen.encoding.tokens import default_max_links
 from morphgen.fitting.token_shapes import token_shapes
-from morphgen.formats.fits import are_primitives, read_stored_fits, stored_fit
 from morphgen.grammar.library import Library
-from morphgen.model.geometry import Shape
 from morphgen.model.kinematics import driving_joints, joint_limits
 from morphgen.model.robot import TOOL, Robot
 from morphgen.typing import Array
 from morphgen.viewer import markup
-from morphgen.viewer.figures import blend
 from morphgen.viewer.robot_tables import has_tool
 from morphgen.viewer.robot_uri import with_library_meshes
-
-FitQuality = dict[str, tuple[float, tuple[Shape, ...]]]
-"""By the name of a link: its primitives, and before them the intersection over union (IoU) of these
-with the shapes that they replace."""
-_RED_TO_GREEN = ((224, 49, 49), (250, 200, 30), (47, 158, 68))
 
 
 def joint_roles(robot: Robot) -> list[str]:
@@ -94,38 +86,3 @@ def similarity_table(names: Sequence[str], similarity: Mapping[str, Array]) -> s
         for i, j in combinations(range(len(names)), 2)
     ]
     return markup.table(header, rows, range(1, len(header)))
-
-
-def fit_quality(robot: Robot, folders: Sequence[Path]) -> FitQuality:
-    """Return how well stored primitives replace the collision shapes of links, where there are any.
-
-    A link whose collision shapes are primitives already has IoU 1.
-    """
-    stored = read_stored_fits(folders)
-    quality: FitQuality = {}
-    for link in with_library_meshes(robot, Library(folders)).links:
-        if link.collisions and are_primitives(link.collisions):
-            quality[link.name] = (1.0, link.collisions)
-        elif link.collisions and (fit := stored_fit(link.collisions, stored)):
-            quality[link.name] = (fit.collision_iou, fit.collision)
-    return quality
-
-
-def iou_colour(iou: float) -> tuple[int, int, int]:
-    """Return red for an IoU of 0.5 or less, yellow for 0.75, green for 1."""
-    return blend(_RED_TO_GREEN, min(max((iou - 0.5) / 0.5, 0.0), 1.0))
-
-
-def fit_table(robot: Robot, quality: FitQuality) -> str:
-    """Return a table of links with the number of their primitives and their IoU."""
-    rows = []
-    for link in robot.links:
-        if not link.collisions:
-            continue
-        if link.name not in quality:
-            rows.append((escape(link.name), "", '<span class="dim">not fitted yet</span>'))
-            continue
-        iou, shapes = quality[link.name]
-        square = f'<span style="color:rgb{iou_colour(iou)}">■</span>'
-        rows.append((escape(link.name), str(len(shapes)), f"{square} {iou:.2f}"))
-    return markup.table(("link", "primitives", "IoU"), rows, (1, 2))

@@ -1,4 +1,4 @@
-"""Robots are compared joint by joint, by their tokens and shape by shape."""
+"""Robots are compared joint by joint and by their tokens."""
 
 import re
 
@@ -15,8 +15,6 @@ from morphgen.model.kinematics import joint_limits
 from morphgen.viewer.comparison import (
     all_roles,
     compare_robots,
-    fit_quality,
-    fit_table,
     joint_roles,
     normalized_positions,
     similarity_table,
@@ -62,34 +60,22 @@ def test_robot_compared_with_itself_is_identical():
     assert "&lt;a&gt; and b" in table
 
 
-def test_fits_have_an_iou():
-    robot = robot_of("arm=ur5 ee=plane")
-    fits = fit_quality(robot, LIBRARY.folders)
-    assert fits["ee_plate"][0] == 1.0
-    assert 0.5 < fits["arm_forearm_link"][0] < 1.0
-    table = fit_table(robot, fits)
-    assert f"{fits['arm_forearm_link'][0]:.2f}" in table
-    assert "not fitted yet" in fit_table(robot, {})
-
-
 def test_positions_of_roles_are_clipped_or_left_out_and_shown_in_the_address(viewer):
     on = viewer()
-    query = "?compare=robots/some-arm&joint1=-3&joint2=x&joint3=nan&show=primitives&lost=1"
+    query = "?compare=robots/some-arm&joint1=-3&joint2=x&joint3=nan&lost=1"
     with PlainClient(on.port, query) as client:
-        client.shows("compare=robots/some-arm&joint1=-1&show=primitives")
-        client.shows("<th >link</th>")
-        assert not nodes(on)["/robot0/1/visual0"].visible
+        client.shows("compare=robots/some-arm&joint1=-1")
         before = nodes(on)["/robot0/2"].position.copy()
         client.change(client.control("Slider", "joint 2"), 0.5)
-        client.shows("joint1=-1&show=primitives&joint2=0.5")
+        client.shows("joint1=-1&joint2=0.5")
         rotated = nodes(on)["/robot0/2"]
         assert not np.allclose(rotated.position, before) or not np.allclose(
             rotated.wxyz, [1, 0, 0, 0]
         )
         client.change(client.control("ButtonGroup", "Go to"), "middle")
-        client.shows("joint1=0&show=primitives&joint2=0&joint3=0&finger1=0")
+        client.shows("joint1=0&joint2=0&joint3=0&finger1=0")
         client.change(client.control("ButtonGroup", "Go to"), "home")
-        shown = (0, "?compare=robots/some-arm&show=primitives")
+        shown = (0, "?compare=robots/some-arm")
         client.until(lambda: client.addresses[-1] == shown)
 
 

@@ -202,11 +202,11 @@ def episode(*num_steps):
 
 def test_curves_have_distance_score_and_a_line_at_the_step():
     distances, totals = curves(episode(5, 3), 2)
-    assert distances[0] == pytest.approx(0.02 * np.arange(1, 6))
-    assert distances[1] == pytest.approx([1, 0.9, 0.8, 0.7, 0.6])
-    assert distances[2] == pytest.approx([1, 0.9, 0.8, 0.8, 0.8])  # it ended after three steps
-    assert distances[3] == pytest.approx([0.6, 1, 0.6, 0.6, 0.6])
-    expected = [score_until(track(5), "reach", i) for i in range(1, 6)]
+    assert distances[0] == pytest.approx([0.02, 0.04, 0.04, 0.04, 0.06, 0.08, 0.1])
+    assert distances[1] == pytest.approx([1, 0.9, 0.9, 0.9, 0.8, 0.7, 0.6])
+    assert distances[2] == pytest.approx([1, 0.9, 0.9, 0.9, 0.8, 0.8, 0.8])  # it ended earlier
+    assert distances[3] == pytest.approx([0.6, 0.6, 1, 0.6, 0.6, 0.6, 0.6])
+    expected = [score_until(track(5), "reach", i) for i in (1, 2, 2, 2, 3, 4, 5)]
     assert totals[1] == pytest.approx(expected)
     assert len(totals) == 4
 
@@ -214,7 +214,7 @@ def test_curves_have_distance_score_and_a_line_at_the_step():
 def test_curves_are_finite_before_the_first_step():
     for data in curves(episode(0, 0), 0):
         assert all(np.isfinite(line).all() for line in data)
-        assert {len(line) for line in data} == {1}
+        assert {len(line) for line in data} == {3}
 
 
 @pytest.mark.slow

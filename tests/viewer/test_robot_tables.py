@@ -15,7 +15,6 @@ from morphgen.model.robot import Inertial
 from morphgen.model.rotation import to_matrix
 from morphgen.viewer.pages.robot import (
     format_joints,
-    free_configuration,
     joint_of_link,
     parse_joints,
     turn_towards,
@@ -110,16 +109,6 @@ def test_the_box_has_the_inertia_of_the_link():
     assert np.linalg.det(axes) == pytest.approx(1)
     assert inertia_box(Inertial(0.0)) is None
     assert inertia_box(Inertial.from_matrix(1.0, (0, 0, 0), np.diag([1.0, 0.1, 0.1]))) is None
-
-
-def test_random_free_configuration_is_collision_free():
-    from morphgen.checks.self_collision import SelfCollisionChecker
-
-    robot = arm()
-    checker = SelfCollisionChecker(robot)
-    q = free_configuration(checker, robot, np.random.default_rng(0))
-    assert q is not None
-    assert list(checker.penetrations([q])) == [{}]
 
 
 ARM = "?robot=robots/some-arm"

@@ -1,4 +1,4 @@
-"""The page that compares robots side by side: joints, similarity, primitives."""
+"""The page that compares robots side by side: joints and similarity."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from morphgen.model.robot import Robot
 from morphgen.viewer import comparison, markup
 from morphgen.viewer.app.address import MAX_COMPARED, Address
 from morphgen.viewer.app.session import Session
-from morphgen.viewer.controls import RoleSliders, add_picker, bind, picked_uri, robot_lists
+from morphgen.viewer.controls import RoleSliders, add_picker, picked_uri, robot_lists
 from morphgen.viewer.robot_uri import UriError, read_robot_uri, uri_name
 from morphgen.viewer.scene import robot as scene_robot
 from morphgen.viewer.scene import stage as scene_stage
@@ -39,7 +39,7 @@ class ComparePage:
     robots: list[Robot]
     views: list[scene_robot.RobotView]
     sliders: RoleSliders = field(init=False)
-    texts: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
+    similarity: viser.GuiHtmlHandle = field(init=False)
 
 
 def show(session: Session) -> None:
@@ -63,22 +63,10 @@ def show(session: Session) -> None:
         _add_robots_tab(page)
     with tabs.add_tab("Move", viser.Icon.ARROWS_MOVE):
         _add_move_tab(page)
-    with tabs.add_tab("Primitives", viser.Icon.CUBE):
-        box = gui.add_checkbox("primitives in place of meshes, coloured by IoU", False)
-        page.texts["fits"] = gui.add_html("")
-
-    def show_primitives() -> None:
-        session.show_state()
-        session.run_in_background(lambda: _show_fits(page, on=box.value))
-
-    session.on_change(box, show_primitives)
     session.set_status("")
     session.title = "compare " + ", ".join(robot.name for robot in robots)
-    bind(session, "show", box, ("primitives",))
     session.apply_state()
     _move(page)
-    if box.value:
-        show_primitives()
     session.show_state()
     session.run_in_background(lambda: _compare(page))
 
@@ -119,7 +107,7 @@ def _add_robots_tab(page: ComparePage) -> None:
     gui.add_html(markup.framed(markup.table(header, rows, (1, 2, 3))))
     if len(page.uris) < MAX_COMPARED:
         _add_picker(page.session, page.uris)
-    page.texts["similarity"] = gui.add_html("")
+    page.similarity = gui.add_html("")
 
 
 def _without(uris: tuple[str, ...], i: int) -> tuple[str, ...]:
@@ -175,35 +163,11 @@ def _move(page: ComparePage) -> None:
     page.session.show_state_later()
 
 
-def _show_fits(page: ComparePage, *, on: bool) -> None:
-    """Show the stored primitives of the robots and their IoU, or the meshes again."""
-    folders = page.session.files.library_folders
-    qualities = [comparison.fit_quality(robot, folders) for robot in page.robots] if on else []
-    page.session.enqueue(lambda: _draw_fits(page, qualities))
-
-
-def _draw_fits(page: ComparePage, qualities: Sequence[comparison.FitQuality]) -> None:
-    """Draw the primitives of the robots; without any, draw the meshes."""
-    parts = []
-    for view in page.views:
-        view.set_visible("visual", not qualities)
-        view.remove_layer("primitives")
-    if qualities:
-        for robot, view, quality in zip(page.robots, page.views, qualities, strict=True):
-            shapes = [quality[link.name][1] if link.name in quality else () for link in robot.links]
-            view.show_shapes("primitives", shapes)
-            colours = {name: comparison.iou_colour(iou) for name, (iou, _) in quality.items()}
-            view.paint("primitives", colours)
-            table = comparison.fit_table(robot, quality)
-            parts.append(f"<h3>{escape(robot.name)}</h3>{table}")
-    page.texts["fits"].content = markup.framed(*parts)
-
-
 def _compare(page: ComparePage) -> None:
     """Show how similar the robots are, or why they cannot be compared."""
     session, names = page.session, [robot.name for robot in page.robots]
     if len(names) == 1:
-        page.texts["similarity"].content = markup.framed(markup.dim(ONE_ROBOT))
+        page.similarity.content = markup.framed(markup.dim(ONE_ROBOT))
         return
     try:
         folders = session.files.library_folders
@@ -213,4 +177,4 @@ def _compare(page: ComparePage) -> None:
     except MorphgenError as error:
         tag = markup.tag("cannot be compared", "warning")
         content = f"{tag}{escape(session.files.redact(error))}"
-    page.texts["similarity"].content = markup.framed(content)
+    page.similarity.content = markup.framed(content)

@@ -407,7 +407,7 @@ def add_charts(gui: viser.GuiApi, episode: Episode, *, dark: bool) -> list[viser
 def curves(episode: Episode, step: int) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
     """Return the data of the charts of distance and score: time, the robots' curves, and a line.
 
-    uPlot has no vertical lines; a curve at the bottom with a peak at the step looks like one.
+    uPlot has no vertical lines; the line is a curve with three values at the step: low, high, low.
     Robots whose episode ended earlier keep their last value: uPlot draws no curve with NaN.
     """
     num_steps = max(episode.num_steps, 1)
@@ -420,11 +420,12 @@ def curves(episode: Episode, step: int) -> tuple[tuple[Array, ...], tuple[Array,
         values = [score(total, last, i) for i, (total, last) in enumerate(sums, 1)]
         distances.append(_padded(track.distance[:n], num_steps))
         totals.append(_padded(values, num_steps))
-    is_now = np.arange(1, num_steps + 1) == min(step, num_steps)
+    now = min(max(step, 1), num_steps) - 1
+    rows = np.insert(np.arange(num_steps), now, (now, now))
 
     def with_line(values: list[Array]) -> tuple[Array, ...]:
-        low, high = np.min(values), np.max(values)
-        return (time, *values, np.where(is_now, high, low))
+        line = np.where(np.arange(len(rows)) == now + 1, np.max(values), np.min(values))
+        return (*(curve[rows] for curve in (time, *values)), line)
 
     return with_line(distances), with_line(totals)
 

@@ -64,7 +64,6 @@ PANEL_WIDTH = 390.0  # width of the panel [pixels]
 RENDER_TIMEOUT = 60.0  # time in which the browser has to send a screenshot [s]
 NO_LINK = "(none)"  # choice of the dropdown of links that selects none
 ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": 180 / math.pi}  # number per radian
-MAX_TRIES = 500  # random configurations that are tested to find one without collision
 _DRAG_ROUNDS = 4  # Newton steps by which a joint follows the pointer, per event
 _MAX_TURN = 0.4  # largest such step [rad or m]
 
@@ -146,7 +145,7 @@ class RobotPage:
         self._card, self._mark = gui.add_html(""), gui.add_html("")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Move", viser.Icon.ARROWS_MOVE):
-            buttons = gui.add_button_group("Go to", ("home", "zero", "random free"))
+            buttons = gui.add_button_group("Go to", ("home", "zero", "random"))
             kinds = (robot.joints[k].kind for k in robot.independent_joints)
             visible = any(kind != "prismatic" for kind in kinds)
             self._angles = gui.add_dropdown("Angles in", tuple(ANGLES), visible=visible)
@@ -252,18 +251,13 @@ class RobotPage:
         self.update_scene()
 
     def _go_to(self, target: str) -> None:
-        """Move the robot to a configuration: ``home``, ``zero`` or ``random free``."""
-        if target == "random free":
-            self._checker = self._checker or SelfCollisionChecker(self.robot)
-            q = free_configuration(self._checker, self.robot, np.random.default_rng())
-            if q is None:
-                text = f"{MAX_TRIES} random ones collide"
-                self.session.notify("No free configuration", text, error=True)
-                return
+        """Move the robot to a configuration: ``home``, ``zero`` or ``random``."""
+        robot = self.robot
+        if target == "random":
+            (q,) = random_configurations(robot, 1, np.random.default_rng())
         else:
-            q = np.array(self.robot.home) if target == "home" else np.zeros(self.robot.dof)
-            q = np.clip(q, *joint_limits(self.robot).T)
-        self.move(q)
+            q = np.array(robot.home) if target == "home" else np.zeros(robot.dof)
+        self.move(np.clip(q, *joint_limits(robot).T))
 
     def select(self, name: str) -> None:
         """Select a link: outline, card and slider; an empty name selects none."""
@@ -404,17 +398,6 @@ def joint_of_link(robot: Robot, link: int) -> int | None:
     return None
 
 
-def free_configuration(
-    checker: SelfCollisionChecker, robot: Robot, rng: np.random.Generator
-) -> Array | None:
-    """Return a random configuration without self-collision; None if all tries collide."""
-    for _ in range(MAX_TRIES):
-        q = random_configurations(robot, 1, rng)
-        if list(checker.penetrations(q)) == [{}]:
-            return np.asarray(q[0])
-    return None
-
-
 def format_joints(q: Array) -> str:
     """Return a configuration as text for an address."""
     return ",".join(f"{value:.4g}" for value in q)
@@ -459,17 +442,19 @@ class Layers:
         self._primitives: Sequence[Sequence[Shape]] | None = None  # by link, once they were shown
         self._workspace: tuple[Array, scene_stage.Triangles] | None = None
         """Tool positions (n, 3) [m] and their shell, once they are sampled."""
-        self._slice_y = 0.0  # position of the slice that the address or the slider has [m]
         self._gizmo: viser.TransformControlsHandle | None = None
         self._is_dragging = False
         names = [name for name in TOGGLES if has_tool(page.robot) or name not in TOOL_TOGGLES]
         self._boxes = {name: gui.add_checkbox(name, name == "visual") for name in names}
-        self._slice = gui.add_slider("slice at y [m]", -1.0, 1.0, _STEP, 0.0, visible=False)
+        extent = scene_robot.robot_extent(page.robot)
+        self._slice = gui.add_slider(
+            "slice at y [m]", -2 * extent, 2 * extent, _STEP, 0.0, visible=False
+        )
         self._legend = gui.add_html("")
         for name, box in self._boxes.items():
             session.on_change(box, functools.partial(self._toggle, name))
         session.on_change(self._slice, self._move_slice, "slice")
-        session.keep("slice", self._write_slice, self._apply_slice)
+        bind(session, "slice", self._slice)
         session.keep("show", self._write, self._apply)
 
     def show(self) -> None:
@@ -498,17 +483,6 @@ class Layers:
     def _apply(self, text: str) -> None:
         for name, box in self._boxes.items():
             set_value(box, name in text.split(","))
-
-    def _write_slice(self) -> str:
-        is_shown = self._is_on("workspace") and abs(self._slice_y) > _STEP / 2
-        return f"{self._slice_y:.3g}" if is_shown else ""
-
-    def _apply_slice(self, text: str) -> None:
-        try:
-            y = float(text)
-        except ValueError:
-            y = 0.0
-        self._slice_y = y if math.isfinite(y) else 0.0
 
     def _is_on(self, name: str) -> bool:
         """Return whether a box exists and is checked."""
@@ -608,7 +582,7 @@ class Layers:
         slider, (low, high) = self._slice, (points.min(axis=0), points.max(axis=0))
         slider.min = float(np.floor(low[1] / _STEP) * _STEP)
         slider.max = float(max(np.ceil(high[1] / _STEP) * _STEP, slider.min + _STEP))
-        set_value(slider, float(np.clip(self._slice_y, slider.min, slider.max)))
+        set_value(slider, float(np.clip(slider.value, slider.min, slider.max)))
         slider.visible = True
         self._legend.content = markup.framed(_legend(high - low))
         self._move_slice()
@@ -619,9 +593,8 @@ class Layers:
     def _move_slice(self) -> None:
         """Draw the workspace, cut at the slider's position."""
         if self._workspace is not None and self._is_on("workspace"):
-            self._slice_y = self._slice.value
             with self._session.client.atomic():
-                scene_overlays.show_workspace(self._overlays, *self._workspace, self._slice_y)
+                scene_overlays.show_workspace(self._overlays, *self._workspace, self._slice.value)
             self._session.show_state_later()
 
     def _toggle_gizmo(self, on: bool) -> None:
