@@ -181,7 +181,7 @@ def show_histograms(gallery: Gallery) -> None:
         control = gallery.controls[fact]
         low, high = control.value
         svg = figures.histogram_svg(values, (control.min, control.max), (low, high))
-        handle.content = markup.framed(svg)
+        handle.content = markup.framed(f'<div class="histogram">{svg}</div>')
 
 
 def parse_range(

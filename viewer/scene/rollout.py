@@ -119,8 +119,8 @@ def _add_track(
     if track.block and track.block_size is not None:
         block = _add_box(scene, f"{name}/block", Block(track.block_size, Pose()), _BLOCK)
     if labelled:
-        top = float(robot_bounds(track.robot)[1][2])
-        scene.add_label(f"{name}/label", track.robot.name, position=(0.0, 0.0, top + 0.1))
+        foot = (0.0, 0.0, track.ground or 0.0)  # a robot moves away from a name above it
+        scene.add_label(f"{name}/label", track.robot.name, position=foot, anchor="top-center")
     return DrawnTrack(track, view, block, markers)
 
 
