@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
@@ -391,10 +392,19 @@ def add_charts(gui: viser.GuiApi, episode: Episode, *, dark: bool) -> list[viser
     """Add the charts of the distance to success and of the score, one below the other."""
     names = [track.robot.name for track in episode.tracks]
     labels = (f"m from {TASKS[episode.task].target}", "score so far")
+    plain = uplot.Series_Points(show=False)
+    series = [
+        uplot.Series(label="time (s)"),
+        *(
+            uplot.Series(label=name, stroke=colour, width=2, points=plain)
+            for name, colour in zip(names, itertools.cycle(COLOURS), strict=False)
+        ),
+        uplot.Series(label="shown", stroke=_NOW, width=1, points=plain),  # the current time
+    ]
     return [
         gui.add_uplot(
             data,
-            _series(names),
+            tuple(series),
             axes=(_axis("time (s)", dark=dark), _axis(label, dark=dark)),
             scales={"x": uplot.Scale(time=False)},
             legend=uplot.Legend(show=label == "score so far" and len(names) > 1),
@@ -433,17 +443,6 @@ def curves(episode: Episode, step: int) -> tuple[tuple[Array, ...], tuple[Array,
 def _padded(values: list[float], length: int) -> Array:
     """Return values, the last one repeated up to a length; zeros if there are none."""
     return np.pad(np.array(values or [0.0]), (0, length - max(len(values), 1)), mode="edge")
-
-
-def _series(names: list[str]) -> tuple[uplot.Series, ...]:
-    """Return the curves of the robots, and the line at the current time."""
-    colours = [COLOURS[i % len(COLOURS)] for i in range(len(names))]
-    lines = [
-        uplot.Series(label=name, stroke=colour, width=2, points={"show": False})
-        for name, colour in zip(names, colours, strict=True)
-    ]
-    now = uplot.Series(label="shown", stroke=_NOW, width=1, points={"show": False})
-    return (uplot.Series(label="time (s)"), *lines, now)
 
 
 def _axis(label: str, *, dark: bool) -> uplot.Axis:
