@@ -88,7 +88,6 @@ def test_url_reveals_nothing_outside_the_folders(shared_viewer, capfd, secret, q
         ("?play=%00.npz", "no such file or folder"),
         ("?play=reach&policy=%00", "neither a checkpoint nor a policy"),
         ("?play=reach&policy=ikk", "did you mean 'ik'"),
-        ("?play=reach&seed=" + "9" * 5000, "seed '9+.*: expected a whole number"),
         ("?robot=derivation:" + DEEP, "more than 100 parts"),
         ("?play=reach&robot=derivation:" + DEEP, "more than 100 parts"),
         ("?compare=derivation:" + DEEP, "more than 100 parts"),

@@ -239,9 +239,9 @@ def test_a_rollout_opens_with_the_shipped_policy_of_its_task(task, obstacles, po
         ("?play=rech", ["did you mean"]),
         ("?play=robots/prims/index.jsonl", ["no task"]),
         (
-            f"?play=reach&robot={CUBE}&policy=random&seed=x&sim=bullet&t=soon",
+            f"?play=reach&robot={CUBE}&policy=random&sim=bullet&t=soon&seed=" + "9" * 5000,
             [
-                "seed=x was left out; expected a number",
+                f"seed={'9' * 40} was left out; expected a number",
                 "sim=bullet was left out; expected mujoco",
                 "t=soon is no time; expected seconds, 0 or more",
             ],
