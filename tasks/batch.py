@@ -143,7 +143,7 @@ class TaskBatch:
         self.previous_qd = self.motion.previous_qd
         self.episode_step = torch.zeros(n, dtype=torch.int64, device=device)
         env_number = torch.arange(first, first + n, device=device)
-        self._episodes = EpisodeSequence(seed, env_number, torch.zeros_like(env_number))
+        self._episodes = EpisodeSequence(seed, env_number)
         # Simulated joints are padded to the largest robot of the simulation, tables perhaps to more
         self._num_sim_joints = simulation.q.shape[1]
         self.observation_config = observe or ObservationConfig()
@@ -369,14 +369,11 @@ class TaskBatch:
             tool=self.observation.tool_positions(q),
             block_pose=state.block_pose,
             diverged=diverged,
-            tool_rotation=self._tool_rotation(q) if self.groups.needs_tool_rotation else None,
         )
+        if self.groups.needs_tool_rotation:
+            T_root_tool = frame_pose(self.robot_tables.tool_chain, self.env_robot_index, q)
+            task_state.tool_rotation = T_root_tool[:, :3, :3]
         return self.groups.evaluate(task_state)
-
-    def _tool_rotation(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the rotation matrices of the tools, shape (n, 3, 3)."""
-        T_root_tool = frame_pose(self.robot_tables.tool_chain, self.env_robot_index, q)
-        return T_root_tool[:, :3, :3]
 
     def _begin(self, mask: torch.Tensor, options: Mapping[str, Any] | None = None) -> EpisodeRandom:
         """Begin episodes in some environments; return their random numbers.

@@ -114,10 +114,10 @@ class EpisodeSequence:
 
     seed: int | tuple[int, ...]
 
-    def __init__(self, seed: int, env_number: torch.Tensor, next_episode: torch.Tensor) -> None:
-        """Set up; for the arguments see the attributes."""
-        self._numbers, self.next_episode = env_number, next_episode.clone()
-        self.restart(seed, next_episode)
+    def __init__(self, seed: int, env_number: torch.Tensor) -> None:
+        """Begin with the first episodes; for the arguments see the attributes."""
+        self._numbers, self.next_episode = env_number, torch.zeros_like(env_number)
+        self.restart(seed, self.next_episode)
 
     def restart(self, seed: int | Sequence[int], next_episode: torch.Tensor) -> None:
         """Go on with another seed and other episodes; see the attributes."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.model.geometry import Pose
+from morphgen.model.inertia import box_corners
 from morphgen.model.robot import Robot
 from morphgen.tasks.free_space import FreeSpace, outside_limits
 from morphgen.tasks.push.config import PushConfig
@@ -189,9 +190,9 @@ class Push(Task[PushConfig, PushStartSet]):
         """Return corners of the block at its starts, and where it has crossed the line."""
         across = goals.blocks[:, :3].copy()
         across[:, 1] = goals.line
-        signs = np.array(np.meshgrid(*[(-0.5, 0.5)] * 3)).reshape(3, -1).T
+        half = np.array(goals.block.size) / 2
         centres = np.concatenate([goals.blocks[:, :3], across])
-        return (centres[:, None] + signs * goals.block.size).reshape(-1, 3)
+        return (centres[:, None] + box_corners(-half, half)).reshape(-1, 3)
 
 
 PUSH = Push()

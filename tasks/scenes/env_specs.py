@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from itertools import product
 from os import PathLike
 from typing import Any, Literal
 
@@ -16,7 +15,7 @@ from morphgen.errors import TaskError, nearest
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.grammar.library import Library, LibraryFolders, default_library
 from morphgen.grammar.robot_source import RobotLike, resolve_robot
-from morphgen.model.inertia import bounding_box
+from morphgen.model.inertia import bounding_box, box_corners
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Robot
 from morphgen.splits.split import Member, compose_member
@@ -165,6 +164,6 @@ def ground_under(robot: Robot) -> float:
     heights = [0.0]
     for link, T in zip(robot.links[1:], T_root_link[1:], strict=True):
         if link.collisions:
-            corners = np.array(list(product(*bounding_box(link.collisions).T)))
+            corners = box_corners(*bounding_box(link.collisions))
             heights.append(float((corners @ T[2, :3] + T[2, 3]).min()))
     return math.floor(min(heights) / GROUND_STEP) * GROUND_STEP  # part of the key of a goal set

@@ -76,7 +76,7 @@ def test_numbers_do_not_depend_on_other_rows_or_on_how_many_are_drawn():
 
 def test_environments_begin_one_episode_after_the_other():
     numbers_of = torch.arange(3, 7)
-    sequence = EpisodeSequence(MAX_SEED, numbers_of, torch.zeros(4, dtype=torch.int64))
+    sequence = EpisodeSequence(MAX_SEED, numbers_of)
     first = sequence.begin(torch.tensor([True, False, True, False]))
     second = sequence.begin(torch.tensor([True, True, False, False]))
     assert first.episode.tolist() == [0, 0, 0, 0]
@@ -89,7 +89,7 @@ def test_environments_begin_one_episode_after_the_other():
 @pytest.mark.parametrize("seed", [-1, 2**64])
 def test_seeds_out_of_range_are_rejected(seed):
     with pytest.raises(TaskError, match=rf"seed {seed}: expected 0 to 2\^64 - 1"):
-        EpisodeSequence(seed, torch.arange(1), torch.zeros(1, dtype=torch.int64))
+        EpisodeSequence(seed, torch.arange(1))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
