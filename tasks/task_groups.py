@@ -128,11 +128,8 @@ class TaskGroups:
             if any(specs[i].config != config for i in members):
                 raise TaskError(f"environments at {name} have different constants; expected one")
             member_of = {i: k for k, i in enumerate(members)}
-            rows, member_index = (
-                torch.tensor([(env, member_of[i]) for env, i in enumerate(index) if i in member_of])
-                .T.contiguous()
-                .to(device)
-            )
+            pairs = [(env, member_of[i]) for env, i in enumerate(index) if i in member_of]
+            rows, member_index = torch.tensor(pairs, device=device).T.contiguous()
             envs = task.make_envs([specs[i] for i in members], member_index, num_joints)
             require_returned(name, "make_envs", envs, isinstance(envs, TaskEnvs), "TaskEnvs")
             _require_methods(name, envs)
