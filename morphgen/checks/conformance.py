@@ -22,7 +22,7 @@ from lxml import etree
 
 from morphgen.arguments import whole_number
 from morphgen.checks.hold import HoldRow
-from morphgen.checks.quirks import REFUSALS, Quirk
+from morphgen.checks.quirks import QUIRKS, REFUSALS, Quirk
 from morphgen.checks.readers import LOADERS, NO_LIMITS, Loader, Reading
 from morphgen.errors import FormatError, one_line
 from morphgen.formats.bundle import URDF, read_bundle
@@ -458,16 +458,16 @@ def _refused(
     text, first = file.read_bytes(), {name: q[:1] for name, q in positions.items()}
     root, left = etree.fromstring(text), [*REFUSALS]
     try:
-        while refusal := next((each for each in left if re.search(each.pattern, message)), None):
-            left.remove(refusal)
+        while quirk := next((each for each in left if re.search(each.refusal, message)), None):
+            left.remove(quirk)
             changed = deepcopy(root)
-            refusal.change(changed, file)
+            quirk.change(changed, file)
             file.write_bytes(etree.tostring(changed))
             result = _read(loader, folder, frame, first, 1)
             if isinstance(result, Reading):
-                return (*words, refusal.words)
-            if not re.search(refusal.pattern, result):
-                words.append(refusal.words)
+                return (*words, quirk.words)
+            if not re.search(quirk.refusal, result):
+                words.append(quirk.words)
                 root, message = changed, result
     finally:
         file.write_bytes(text)
@@ -493,10 +493,10 @@ def _differing(
         q = np.array([positions[name] for name in names]).reshape(len(names), n).T
         return bool(_compared(loader, robot, reading, frame, q).passed)
 
-    chosen = list(loader.quirks)
-    if not chosen or not explain(chosen):
+    chosen = known = [quirk for quirk in QUIRKS if loader.name in quirk.loaders]
+    if not known or not explain(known):
         return ()
-    for quirk in loader.quirks:
+    for quirk in known:
         fewer = [each for each in chosen if each is not quirk]
         if explain(fewer):
             chosen = fewer

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,27 +24,51 @@ Change = Callable[[etree._Element, Path], None]
 
 @dataclass(frozen=True)
 class Quirk:
-    """How a loader reads a URDF otherwise than morphgen."""
+    """How loaders read a URDF otherwise than morphgen, or what they refuse in it."""
 
     words: str  # description of the deviation
-    change: Change  # changes a URDF so that morphgen reads it as the loader does
+    change: Change
+    """Changes a URDF so that morphgen reads it as the loaders do, or so that they read it."""
+    loaders: tuple[str, ...] = ()  # names of the loaders that read so
+    refusal: str = ""  # regular expression of the message with which a loader refuses the file
 
 
-@dataclass(frozen=True)
-class Refusal(Quirk):
-    """A reason why a loader refuses a URDF; ``change`` takes it out of the file."""
-
-    pattern: str  # regular expression of the loader's message
+QUIRKS: list[Quirk] = []
+"""All deviations of loaders from the URDF specification, in the order in which they are applied."""
 
 
+def _quirk(words: str, *loaders: str, refusal: str = "") -> Callable[[Change], Change]:
+    """Make a change of a URDF the test of a quirk."""
+
+    def register(change: Change) -> Change:
+        QUIRKS.append(Quirk(words, change, loaders, refusal))
+        return change
+
+    return register
+
+
+@_quirk("reads no quat_xyzw", "yourdfpy", "pybullet", "mujoco (urdf)", "usd")
+def _drop_quaternions(root: etree._Element, urdf: Path) -> None:
+    for origin in root.iter("origin"):
+        origin.attrib.pop("quat_xyzw", "")
+
+
+@_quirk("counts the inertia of links without mass", "pybullet", "pinocchio")
+def _count_massless(root: etree._Element, urdf: Path) -> None:
+    for mass in root.iterfind("link/inertial/mass"):
+        if float(mass.get("value") or 0) == 0:
+            mass.set("value", repr(BOUND_MASS))
+
+
+@_quirk("gives links without inertia 1 kg and 1 kg m^2", "pybullet")
 def _add_inertia(root: etree._Element, urdf: Path) -> None:
     for link in root.iterfind("link"):
         if link.find("inertial") is None and link.get("name") != "world":
             _set_inertial(link, 1.0, np.eye(3))
 
 
+@_quirk("gives links without inertia that of their shapes, of 1000 kg/m^3", "mujoco (urdf)")
 def _add_solids(root: etree._Element, urdf: Path) -> None:
-    """Give links without inertia the one that MuJoCo makes of their shapes."""
     import mujoco
 
     spec = mujoco.MjSpec.from_file(str(urdf))
@@ -73,11 +96,7 @@ def _set_inertial(
     etree.SubElement(element, "inertia", dict(zip(_INERTIA, map(repr, values), strict=True)))
 
 
-def _drop_quaternions(root: etree._Element, urdf: Path) -> None:
-    for origin in root.iter("origin"):
-        origin.attrib.pop("quat_xyzw", "")
-
-
+@_quirk("joins the base to the world, without its mass", "mujoco (urdf)")
 def _empty_base(root: etree._Element, urdf: Path) -> None:
     """Remove the inertia of the root and of the links that are fixed to it."""
     parents = {}
@@ -96,14 +115,8 @@ def _empty_base(root: etree._Element, urdf: Path) -> None:
                 link.remove(inertial)
 
 
-def _count_massless(root: etree._Element, urdf: Path) -> None:
-    for mass in root.iterfind("link/inertial/mass"):
-        if float(mass.get("value") or 0) == 0:
-            mass.set("value", repr(BOUND_MASS))
-
-
 def _set_inertias(
-    root: etree._Element, urdf: Path, is_wrong: Callable[[float, float, float], bool], moment: str
+    root: etree._Element, is_wrong: Callable[[float, float, float], bool], moment: str
 ) -> None:
     """Set the moments of inertia that are wrong; they are tested in ascending order."""
     for inertia in root.iterfind("link/inertial/inertia"):
@@ -115,6 +128,12 @@ def _set_inertias(
                 inertia.set(name, moment if name[1] == name[2] else "0")
 
 
+@_quirk("sets inertia that no body has to zero", "pybullet")
+def _zero_impossible(root: etree._Element, urdf: Path) -> None:
+    _set_inertias(root, lambda a, b, c: a < 0 or c > a + b, "0")
+
+
+@_quirk("limits continuous joints that name a range", "pybullet")
 def _limit_continuous(root: etree._Element, urdf: Path) -> None:
     for joint in root.iterfind("joint[@type='continuous']"):
         limit = joint.find("limit")
@@ -122,6 +141,24 @@ def _limit_continuous(root: etree._Element, urdf: Path) -> None:
             joint.set("type", "revolute")
 
 
+def _open_ranges(root: etree._Element, is_open: Callable[[float, float], bool]) -> None:
+    for limit in root.iterfind("joint/limit"):
+        if is_open(*(float(limit.get(name) or 0) for name in ("lower", "upper"))):
+            for name in ("lower", "upper"):
+                limit.attrib.pop(name, "")
+
+
+@_quirk("reads a range in the wrong order as none", "pybullet", "mujoco (urdf)")
+def _open_inverted(root: etree._Element, urdf: Path) -> None:
+    _open_ranges(root, lambda lower, upper: lower > upper)
+
+
+@_quirk("reads a range of 0 to 0 as none", "mujoco (urdf)")
+def _open_empty(root: etree._Element, urdf: Path) -> None:
+    _open_ranges(root, lambda lower, upper: lower == upper == 0)
+
+
+@_quirk("reads a range that is missing as 0 to 0", "pinocchio", "usd")
 def _zero_ranges(root: etree._Element, urdf: Path) -> None:
     for limit in root.iterfind("joint/limit"):
         if not {"lower", "upper"} & set(limit.attrib):
@@ -129,13 +166,7 @@ def _zero_ranges(root: etree._Element, urdf: Path) -> None:
             limit.set("upper", "0")
 
 
-def _open_ranges(root: etree._Element, urdf: Path, is_open: Callable[[float, float], bool]) -> None:
-    for limit in root.iterfind("joint/limit"):
-        if is_open(*(float(limit.get(name) or 0) for name in ("lower", "upper"))):
-            for name in ("lower", "upper"):
-                limit.attrib.pop(name, "")
-
-
+@_quirk("holds joints that mimic a missing one", "yourdfpy")
 def _hold_lost_followers(root: etree._Element, urdf: Path) -> None:
     """Let joints that mimic a missing one follow a fixed one, and so stay."""
     joints = {joint.get("name"): joint.get("type") for joint in root.iterfind("joint")}
@@ -145,23 +176,41 @@ def _hold_lost_followers(root: etree._Element, urdf: Path) -> None:
             mimic.set("joint", fixed)
 
 
+MIN_VALUE = 1e-14
+"""Largest mass and moment of inertia that MuJoCo 4.0 takes for zero [kg or kg m^2]."""
+
+
+@_quirk("refuses moving links without mass or inertia", refusal="mass and inertia of moving bodies")
 def _add_mass(root: etree._Element, urdf: Path) -> None:
-    """Give mass and inertia to links that have none."""
     for link in root.iterfind("link"):
         mass = link.find("inertial/mass")
         if mass is None or float(mass.get("value") or 0) <= MIN_VALUE:
             _set_inertial(link, 1.0, np.eye(3))
-    _set_inertias(root, urdf, lambda a, b, c: c <= MIN_VALUE, "1")
+    _set_inertias(root, lambda a, b, c: c <= MIN_VALUE, "1")
 
 
+@_quirk("refuses inertia that no body has", refusal=r"A \+ B >= C")
+def _correct_impossible(root: etree._Element, urdf: Path) -> None:
+    # Rounding may have passed a + b = c already.
+    _set_inertias(root, lambda a, b, c: a + b <= c * (1 + 1e-9), "1")
+
+
+@_quirk("refuses inertia that is not positive", refusal="must have positive eigenvalues")
+def _correct_negative(root: etree._Element, urdf: Path) -> None:
+    _set_inertias(root, lambda a, b, c: a <= MIN_VALUE, "1")
+
+
+@_quirk(
+    "refuses <inertial> without <inertia>",
+    refusal="missing element: 'inertia'|Cannot load URDF file",
+)
 def _add_missing_inertia(root: etree._Element, urdf: Path) -> None:
     for inertial in root.iterfind("link/inertial"):
         if inertial.find("inertia") is None:
-            etree.SubElement(
-                inertial, "inertia", ixx="1", ixy="0", ixz="0", iyy="1", iyz="0", izz="1"
-            )
+            etree.SubElement(inertial, "inertia", dict(zip(_INERTIA, "100101", strict=True)))
 
 
+@_quirk("refuses a repeated element", refusal="repeated element")
 def _take_first(root: etree._Element, urdf: Path) -> None:
     """Remove elements that follow one of the same name where there may be one."""
     for parent in (*root.iterfind("joint"), *root.iterfind("link/*")):
@@ -170,11 +219,16 @@ def _take_first(root: etree._Element, urdf: Path) -> None:
                 parent.remove(surplus)
 
 
+@_quirk(
+    "refuses a mesh scale of more than three numbers",
+    refusal="'scale' has too much data|mesh: scale: .* but 3 expected",
+)
 def _shorten_scales(root: etree._Element, urdf: Path) -> None:
     for mesh in root.iter("mesh"):
         mesh.set("scale", " ".join(mesh.get("scale", "1 1 1").split()[:3]))
 
 
+@_quirk("refuses shapes without a size", refusal=r"size \d must be positive")
 def _thicken(root: etree._Element, urdf: Path) -> None:
     """Give every dimension of zero a millimetre."""
     for shape in root.iterfind("link/*/geometry/*"):
@@ -183,6 +237,10 @@ def _thicken(root: etree._Element, urdf: Path) -> None:
             shape.set(name, " ".join(sizes))
 
 
+@_quirk(
+    f"fails on robots with more than {PYBULLET_LINKS} links",
+    refusal="Cannot load URDF file|getLinkState failed",
+)
 def _drop_links(root: etree._Element, urdf: Path) -> None:
     """Remove links that are fixed to others and carry none, until 127 are left below the root."""
     links = {link.get("name"): link for link in root.iterfind("link")}
@@ -195,6 +253,7 @@ def _drop_links(root: etree._Element, urdf: Path) -> None:
             root.remove(links[name])
 
 
+@_quirk("refuses a joint that mimics a missing one", refusal="Mimic joint '.*' not found")
 def _drop_lost_mimics(root: etree._Element, urdf: Path) -> None:
     joints = {joint.get("name") for joint in root.iterfind("joint")}
     for joint in root.iterfind("joint"):
@@ -203,79 +262,5 @@ def _drop_lost_mimics(root: etree._Element, urdf: Path) -> None:
                 joint.remove(mimic)
 
 
-_ZERO_IMPOSSIBLE = partial(_set_inertias, is_wrong=lambda a, b, c: a < 0 or c > a + b, moment="0")
-NO_QUATERNIONS = Quirk("reads no quat_xyzw", _drop_quaternions)
-COUNT_MASSLESS = Quirk("counts the inertia of links without mass", _count_massless)
-NO_WRONG_RANGES = Quirk(
-    "reads a range in the wrong order as none",
-    partial(_open_ranges, is_open=lambda lower, upper: lower > upper),
-)
-ZERO_RANGES = Quirk("reads a range that is missing as 0 to 0", _zero_ranges)
-YOURDFPY_QUIRKS = (
-    NO_QUATERNIONS,
-    Quirk("holds joints that mimic a missing one", _hold_lost_followers),
-)
-PYBULLET_QUIRKS = (
-    NO_QUATERNIONS,
-    COUNT_MASSLESS,
-    Quirk("gives links without inertia 1 kg and 1 kg m^2", _add_inertia),
-    Quirk("sets inertia that no body has to zero", _ZERO_IMPOSSIBLE),
-    Quirk("limits continuous joints that name a range", _limit_continuous),
-    NO_WRONG_RANGES,
-)
-MUJOCO_QUIRKS = (
-    NO_QUATERNIONS,
-    Quirk("gives links without inertia that of their shapes, of 1000 kg/m^3", _add_solids),
-    Quirk("joins the base to the world, without its mass", _empty_base),
-    NO_WRONG_RANGES,
-    Quirk(
-        "reads a range of 0 to 0 as none",
-        partial(_open_ranges, is_open=lambda lower, upper: lower == upper == 0),
-    ),
-)
-PINOCCHIO_QUIRKS = (COUNT_MASSLESS, ZERO_RANGES)
-USD_QUIRKS = (NO_QUATERNIONS, ZERO_RANGES)
-
-MIN_VALUE = 1e-14
-"""Largest mass and moment of inertia that MuJoCo 4.0 takes for zero [kg or kg m^2]."""
-REFUSALS = (
-    Refusal(
-        "refuses moving links without mass or inertia",
-        _add_mass,
-        "mass and inertia of moving bodies",
-    ),
-    Refusal(
-        "refuses inertia that no body has",
-        # Rounding may have passed a + b = c already.
-        partial(_set_inertias, is_wrong=lambda a, b, c: a + b <= c * (1 + 1e-9), moment="1"),
-        r"A \+ B >= C",
-    ),
-    Refusal(
-        "refuses inertia that is not positive",
-        partial(_set_inertias, is_wrong=lambda a, b, c: a <= MIN_VALUE, moment="1"),
-        "must have positive eigenvalues",
-    ),
-    Refusal(
-        "refuses <inertial> without <inertia>",
-        _add_missing_inertia,
-        "missing element: 'inertia'|Cannot load URDF file",
-    ),
-    Refusal("refuses a repeated element", _take_first, "repeated element"),
-    Refusal(
-        "refuses a mesh scale of more than three numbers",
-        _shorten_scales,
-        "'scale' has too much data|mesh: scale: .* but 3 expected",
-    ),
-    Refusal("refuses shapes without a size", _thicken, r"size \d must be positive"),
-    Refusal(
-        f"fails on robots with more than {PYBULLET_LINKS} links",
-        _drop_links,
-        "Cannot load URDF file|getLinkState failed",
-    ),
-    Refusal(
-        "refuses a joint that mimics a missing one",
-        _drop_lost_mimics,
-        "Mimic joint '.*' not found",
-    ),
-)
+REFUSALS = [quirk for quirk in QUIRKS if quirk.refusal]
 """Causes of refusals; each is one only if the loader reads the file without it."""

@@ -13,14 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from morphgen.checks.quirks import (
-    MUJOCO_QUIRKS,
-    PINOCCHIO_QUIRKS,
-    PYBULLET_QUIRKS,
-    USD_QUIRKS,
-    YOURDFPY_QUIRKS,
-    Quirk,
-)
 from morphgen.errors import FormatError, one_line
 from morphgen.formats.bundle import MJCF, URDF
 from morphgen.formats.quiet import quiet
@@ -91,8 +83,6 @@ class Loader:
     read: Read
     """Reads the file; raises ``FormatError`` if the library rejects it or lacks the frame."""
     file: str  # the bundle's file that it reads
-    quirks: tuple[Quirk, ...] = ()
-    """Deviations of the loader from the URDF specification, in files of other tools."""
 
 
 def read_yourdfpy(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
@@ -503,11 +493,11 @@ def _local(position: Any, rotation: Any) -> Array:  # noqa: ANN401
 
 
 LOADERS = (
-    Loader("yourdfpy", "yourdfpy", read_yourdfpy, URDF, YOURDFPY_QUIRKS),
-    Loader("pybullet", "pybullet", read_pybullet, URDF, PYBULLET_QUIRKS),
-    Loader("mujoco (urdf)", "mujoco", partial(read_mujoco, URDF), URDF, MUJOCO_QUIRKS),
+    Loader("yourdfpy", "yourdfpy", read_yourdfpy, URDF),
+    Loader("pybullet", "pybullet", read_pybullet, URDF),
+    Loader("mujoco (urdf)", "mujoco", partial(read_mujoco, URDF), URDF),
     Loader("mujoco (mjcf)", "mujoco", partial(read_mujoco, MJCF), MJCF),
-    Loader("pinocchio", "pinocchio", read_pinocchio, URDF, PINOCCHIO_QUIRKS),
-    Loader("usd", "urdf_usd_converter", read_usd, URDF, USD_QUIRKS),
+    Loader("pinocchio", "pinocchio", read_pinocchio, URDF),
+    Loader("usd", "urdf_usd_converter", read_usd, URDF),
 )
 """Loaders of a bundle. Those of the URDF also read a URDF of others, that of the MJCF an MJCF."""
