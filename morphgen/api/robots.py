@@ -12,7 +12,7 @@ from morphgen.arguments import checked_signature, path_argument, text_argument, 
 from morphgen.checks import check
 from morphgen.errors import CompositionError, FormatError, GrammarError, nearest
 from morphgen.extras import explain_missing_extras
-from morphgen.fitting.collision_geometry import GEOMETRIES, with_geometry
+from morphgen.fitting.replace_collision import GEOMETRIES, with_geometry
 from morphgen.formats.bundle import bundle_folder, read_robot, write_bundle
 from morphgen.grammar.analysis import load_sound_grammar
 from morphgen.grammar.compose import compose as compose_derivation

@@ -15,7 +15,7 @@ from morphgen.checks import check
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, status, track
 from morphgen.errors import CompositionError, FormatError, MorphgenError
-from morphgen.fitting.collision_geometry import with_geometry
+from morphgen.fitting.replace_collision import with_geometry
 from morphgen.formats.bundle import CARD, URDF, bundle_folder, write_bundle
 from morphgen.formats.data_files import read_json
 from morphgen.formats.description import NamedDescription, find_description

@@ -14,8 +14,7 @@ from typing import Any
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, status, track
 from morphgen.errors import FormatError
-from morphgen.fitting.collision_geometry import with_geometry
-from morphgen.fitting.replace_collision import as_spheres
+from morphgen.fitting.replace_collision import as_spheres, with_geometry
 from morphgen.formats.bundle import CARD, URDF, write_bundle
 from morphgen.formats.data_files import read_json, read_text
 from morphgen.grammar import analysis

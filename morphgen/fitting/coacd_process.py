@@ -1,7 +1,7 @@
 """Run CoACD on one mesh: ``python -P coacd_process.py MESH.npz PIECES.npz SETTINGS``.
 
-CoACD is C++ that can crash on a broken mesh and cannot be interrupted, so ``convex_pieces`` runs it
-in a process of its own. This module imports nothing of morphgen, and therefore starts at once.
+CoACD is C++ that can crash on a broken mesh and cannot be interrupted, so ``replace_collision``
+runs it in a process of its own. This module imports nothing of morphgen, and so starts at once.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from morphgen.arguments import whole_number
 from morphgen.encoding.tokens import default_max_links
 from morphgen.errors import TaskError, nearest
 from morphgen.extras import explain_missing_extras
-from morphgen.fitting.convex_pieces import as_convex
+from morphgen.fitting.replace_collision import as_convex
 from morphgen.formats.rounding import as_written
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation

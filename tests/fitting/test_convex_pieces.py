@@ -9,10 +9,9 @@ import trimesh
 import morphgen
 from helpers.robots import chain
 from morphgen.errors import FitError, MeshError
-from morphgen.fitting import convex_pieces as module
-from morphgen.fitting.convex_pieces import MAX_PIECES, as_convex, decompose
+from morphgen.fitting import replace_collision as module
 from morphgen.fitting.fitted_robot import agreement
-from morphgen.fitting.replace_collision import as_primitives
+from morphgen.fitting.replace_collision import MAX_PIECES, as_convex, as_primitives, decompose
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.fits import shapes_key
