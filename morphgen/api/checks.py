@@ -11,7 +11,7 @@ from morphgen import checks
 from morphgen.arguments import checked_signature
 from morphgen.checks.conformance import ConformanceReport, compare, compare_file
 from morphgen.checks.hold import HoldRow, hold_files
-from morphgen.checks.home_pose import home_penetrations
+from morphgen.checks.rules import home_penetrations
 from morphgen.formats.bundle import CARD, bundle_folder, file_findings, read_bundle, write_bundle
 from morphgen.formats.gate import loader_copy
 from morphgen.formats.resolve import default_finder

@@ -7,23 +7,16 @@ a limitation of a loader that a bundle works around, or a finding that a part ac
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import cast
 
-from morphgen.checks import home_pose, rules
+from morphgen.checks.rules import CHECKS, check_self_collision, check_tool, repaired
 from morphgen.model.findings import Finding
 from morphgen.model.mesh import require_bounded_meshes
 from morphgen.model.robot import Robot
 
-Check = Callable[[Robot], Iterator[Finding]]
-
-CHECKS: tuple[Check, ...] = (*rules.CHECKS, *home_pose.CHECKS)
-"""The checks that apply to robots and parts; ``check_tool`` applies to robots only."""
-
 _SEVERITY_RANK = {"error": 0, "warning": 1, "info": 2}
-
-__all__ = ["CHECKS", "Check", "check", "fix", "record_repairs"]
 
 
 def check(
@@ -44,9 +37,9 @@ def check(
         MeshError: If the meshes have too many triangles in all.
     """
     require_bounded_meshes(robot)
-    checks = (*CHECKS, rules.check_tool) if tool_required else CHECKS
+    checks = (*CHECKS, check_tool) if tool_required else CHECKS
     if home_tested:
-        checks = tuple(run for run in checks if run is not home_pose.check_self_collision)
+        checks = tuple(run for run in checks if run is not check_self_collision)
     findings = {_apply_accepted(finding, robot) for run in checks for finding in run(robot)}
     findings.update(robot.source_findings)
     return tuple(
@@ -77,7 +70,7 @@ def fix(robot: Robot) -> tuple[Robot, tuple[Finding, ...]]:
         The repaired robot, whose provenance lists the repairs, and the repaired findings.
     """
     fixable = tuple(f for f in check(robot, tool_required=False) if f.fixable)
-    return (record_repairs(rules.repaired(robot, fixable), fixable) if fixable else robot), fixable
+    return (record_repairs(repaired(robot, fixable), fixable) if fixable else robot), fixable
 
 
 def record_repairs(robot: Robot, findings: tuple[Finding, ...]) -> Robot:

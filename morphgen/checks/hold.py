@@ -21,8 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from morphgen.checks.home_pose import home_penetrations
 from morphgen.checks.readers import NO_LIMITS, bullet_client, load_model
+from morphgen.checks.rules import home_penetrations
 from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.bundle import MJCF, URDF, bundle_folder, write_bundle
 from morphgen.formats.quiet import quiet

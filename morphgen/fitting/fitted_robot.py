@@ -19,7 +19,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from morphgen.checks.home_pose import triangle_collider
+from morphgen.checks.rules import triangle_collider
 from morphgen.checks.self_collision import SelfCollisionChecker, untested_pairs
 from morphgen.errors import FitError
 from morphgen.fitting.link_fit import FitOptions

@@ -8,8 +8,8 @@ import pytest
 import trimesh
 
 from helpers.faulty_robots import hinge, valid_robot, with_end, with_link
-from morphgen.checks import check, home_pose
-from morphgen.checks.home_pose import MAX_GAP, check_links_apart
+from morphgen.checks import check, rules
+from morphgen.checks.rules import MAX_GAP, check_links_apart
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
@@ -102,7 +102,7 @@ def test_distances_of_dense_meshes_do_not_depend_on_the_coarse_test(tmp_path, mo
     ball = mesh(tmp_path, "ball.stl", trimesh.creation.icosphere(5, radius=0.1))
     turned = Pose.from_xyz_rpy((0.0, 0.12, 0.16), (0.3, 0.2, 0.1))
     for few in (5, 500, 10**6):
-        monkeypatch.setattr(home_pose, "_COARSE_TRIANGLES", few)
+        monkeypatch.setattr(rules, "_COARSE_TRIANGLES", few)
         assert gap_findings(pair(ball, ball, Pose((0.0, 0.12, 0.16)))) == []
         assert gap_findings(pair(ball, Sphere(0.1), turned)) == []
         (where_why,) = gap_findings(pair(ball, ball, replace(turned, position=(0.0, 0.138, 0.184))))

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.parts import PINCER, write_part
-from morphgen.checks import home_pose
-from morphgen.checks.home_pose import check_links_apart
+from morphgen.checks import rules
+from morphgen.checks.rules import check_links_apart
 from morphgen.errors import PartError
 from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.xacro.expand import Expansion
@@ -250,7 +250,7 @@ def variation(*factors):
 @given(st.tuples(*[FACTOR] * 7))
 def test_neighbouring_links_stay_in_contact_for_all_scale_factors(factors):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(home_pose, "MAX_GAP", SLIT)
+        patch.setattr(rules, "MAX_GAP", SLIT)
         assert list(check_links_apart(variation(*factors))) == []
 
 
