@@ -62,8 +62,8 @@ class Agreement:
 
     def as_dict(self) -> dict[str, float]:
         """Return plain data for JSON."""
-        shares = {name: round(getattr(self, name), 4) for name in ("precision", "recall")}
-        return {**asdict(self), **shares, "accuracy": round(self.accuracy, 4)}
+        shares = ("precision", "recall", "accuracy")
+        return {**asdict(self), **{name: round(getattr(self, name), 4) for name in shares}}
 
 
 def agreement(
