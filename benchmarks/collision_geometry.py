@@ -50,9 +50,8 @@ from tqdm import tqdm
 import morphgen
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import MorphgenError
-from morphgen.fitting.convex_pieces import as_convex
 from morphgen.fitting.fitted_robot import agreement
-from morphgen.fitting.replace_collision import as_primitives, with_primitives
+from morphgen.fitting.replace_collision import as_convex, as_primitives, with_primitives
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.files import write_file
 from morphgen.formats.fits import are_primitives
