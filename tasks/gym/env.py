@@ -16,7 +16,6 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
@@ -29,26 +28,24 @@ from morphgen.tasks.actions import ActionDecoder, ActionKind, JointMotion
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.gym.vector import (
     LINK_ENTRIES,
-    RENDER_MODES,
     Array,
+    BatchEnv,
     NumpyObservation,
     action_space,
-    final_state,
     from_mapping,
     numpy_observation,
     observation_space,
     render_arguments,
     require_limit,
     task_config,
-    text_spec,
 )
 from morphgen.tasks.observation import LinkJoints, LinkTokens, Observation, ObservationConfig
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
-from morphgen.tasks.render.renderer import SIZE, Frame, Renderer, RenderState, render_state
+from morphgen.tasks.render.renderer import SIZE, Frame
 from morphgen.tasks.rows import numpy_row
 from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.scenes.obstacles import LayoutSide
-from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
+from morphgen.tasks.sim.base import Contacts
 from morphgen.tasks.task import STANDARD_FIELDS, StepFormulas, StepResult, TaskConfig, TaskEnvs
 
 EnvStep = tuple[NumpyObservation, float, bool, bool, dict[str, Any]]
@@ -176,7 +173,7 @@ def _info(result: StepResult[Any], diverged: bool) -> dict[str, Any]:
     return info
 
 
-class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
+class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
     """A robot at a task, such as ``gymnasium.make("morphgen/Reach-v0")`` makes.
 
     Observations are those of ``TaskBatch`` without padding, masks and fields of other tasks; tokens
@@ -212,11 +209,6 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         action_links: Indices of the links of these joints, which are rows of the tokens.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012
-        "render_modes": list(RENDER_MODES),
-        "render_fps": round(1 / CONTROL_PERIOD),
-    }
-
     def __init__(
         self,
         task: str,
@@ -241,7 +233,7 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
 
         The arguments are those of ``make_batch``; pictures have a width and a height [pixels].
         """
-        self._size, self.render_mode = render_arguments(render_mode, size), render_mode
+        render_arguments(render_mode, size)
         sim = sim or DEFAULT_SIMULATOR
         task_kind = TASKS[task]
         observe = from_mapping("observe", ObservationConfig, observe)
@@ -261,12 +253,10 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
                 f"goal_env: task {task} has no goals for hindsight replay; see Task.goal_field"
             )
         self.task = task
-        self._spec: EnvSpec | None = None
         self._goal_env = goal_env
         if goal_env:  # others take an environment with this method for one with goals
             self.compute_reward = self._reward_of_goals
-        self._renderer: Renderer | None = None
-        self.batch = make_batch(
+        batch = make_batch(
             self.task,
             [robot],
             1,
@@ -282,7 +272,8 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             contacts=contacts,
             max_links=max_links,
         )
-        self.env_spec = self.batch.specs[0]
+        self._wrap(batch, render_mode, size)
+        self.env_spec = batch.specs[0]
         robot_links = self.env_spec.robot.joints
         other_fields = set(STANDARD_FIELDS) - set(task_kind.fields)
         self._hidden = {field.name for field in other_fields}
@@ -290,9 +281,8 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
             torch.nonzero(self.batch.action_mask[0])[:, 0].tolist()
         )
         self.action_joints = tuple(robot_links[link - 1].name for link in self.action_links)
-        self._running = self._closed = self._was_reset = self._next_has_begun = False
+        self._was_reset = self._next_has_begun = False
         self._final_physics: tuple[torch.Tensor, torch.Tensor] | None = None
-        self._final_state: RenderState | None = None
         self._stepper = self._make_stepper()
         first = self._in_goal_form(self._without_padding(self.batch.observe()))
         self.observation_space = cast(
@@ -322,16 +312,14 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         if self._stepper is not None:
             self._stepper.begin(observation)
         self._running = self._was_reset = True
-        self._next_has_begun, self._final_state, self._final_physics = False, None, None
+        self._next_has_begun, self._final_states, self._final_physics = False, {}, None
         return self._in_goal_form(observation), {"self_collision": self._self_collision}
 
     def step(
         self, action: NDArray[Any]
     ) -> tuple[NumpyObservation, float, bool, bool, dict[str, Any]]:
         """Act for one control step."""
-        self._require_open()
-        if not self._running:
-            raise TaskError("no episode is running; call reset()")
+        self._require_running()
         action = self._checked(action)
         step = self._torch_step if self._stepper is None else self._stepper.step
         observation, reward, terminated, truncated, info = step(action)
@@ -360,19 +348,9 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
         rewards = TASKS[self.task].goal_reward(self.env_spec.config, *rows)
         return rewards.numpy().reshape(achieved.shape[:-1])
 
-    @property
-    def spec(self) -> EnvSpec | None:
-        """Specification of ``gym.make``, with ``max_episode_steps``; None without it."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = text_spec(spec, self.env_spec.config.max_episode_steps)
-
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy, which makes stepper and renderer anew."""
-        self._require_open()
-        return vars(self) | {"_stepper": None, "_renderer": None}
+        return super().__getstate__() | {"_stepper": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy: views of tensors must be of its own tensors."""
@@ -383,26 +361,13 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
 
     def render(self) -> Frame | None:
         """Return a picture, shape (height, width, 3), if ``render_mode`` is ``rgb_array``."""
-        self._require_open()
-        if self.render_mode is None:
-            gym.logger.warn(
-                'nothing is rendered: make the environment with render_mode="rgb_array"'
-            )
-            return None
-        if self._renderer is None:
-            self._renderer = Renderer.of_spec(self.env_spec, self._size)
-        return self._renderer.frame(self._final_state or render_state(self.batch))
+        frames = self._frames()
+        return None if frames is None else frames[0]
 
     def close(self) -> None:
         """Free everything; a second call does nothing."""
-        self._closed = True
-        self.batch.close()
-        if self._renderer is not None:
-            self._renderer.close()
-
-    def _require_open(self) -> None:
-        if self._closed:
-            raise TaskError("this environment is closed")
+        self.closed = True
+        self._free()
 
     def _checked(self, action: NDArray[Any]) -> NDArray[Any]:
         """Return an action with a number for each of the task's joints."""
@@ -420,15 +385,12 @@ class TaskEnv(gym.Env[NumpyObservation, NDArray[Any]]):
 
     def _torch_step(self, action: NDArray[Any]) -> EnvStep:
         """Step the batch, which begins the next episode where one ends."""
-        before = render_state(self.batch) if self.render_mode is not None else None
         actions = torch.zeros(self.batch.action_mask.shape, dtype=torch.from_numpy(action).dtype)
         actions[0, list(self.action_links)] = torch.from_numpy(action)
-        step = self.batch.step(actions)
+        step = self._step_batch(actions, None, keeps_ends=True)
         if step.terminated[0] or step.truncated[0]:
             self._next_has_begun = True
             self._final_physics = step.q, step.block_pose
-            if before is not None:
-                self._final_state = final_state(before, step)
         observation, ended = self._without_padding(step.final_observation), bool(step.terminated)
         info = _info(step, bool(step.diverged))
         return observation, float(step.reward), ended, bool(step.truncated), info

@@ -134,14 +134,6 @@ class TextSpec(EnvSpec):
         return EnvSpec.to_json(replace(self, kwargs=kwargs))
 
 
-def text_spec(spec: EnvSpec | None, limit: int) -> TextSpec | None:
-    """Return a specification of ``gym.make`` with the time limit of episodes [control steps]."""
-    if spec is None:
-        return None
-    values = {each.name: getattr(spec, each.name) for each in fields(spec) if each.init}
-    return TextSpec(**values | {"max_episode_steps": spec.max_episode_steps or limit})
-
-
 def _plain(value: Any) -> Any:  # noqa: ANN401 - any argument of an environment
     """Return an argument of an environment as JSON data."""
     if isinstance(value, Robot):
@@ -157,7 +149,102 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 - any argument of an environment
     return str(value) if isinstance(value, PathLike) else value
 
 
-class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
+class BatchEnv:
+    """What one environment and a vector of them have in common: pictures, specification, copies.
+
+    Attributes:
+        batch: The batch, which it owns.
+        max_episode_steps: Time limit of episodes, of the longest if tasks differ [control steps].
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": list(RENDER_MODES),
+        "render_fps": round(1 / CONTROL_PERIOD),
+    }
+    batch: TaskBatch
+    max_episode_steps: int
+    closed = False
+
+    def _wrap(self, batch: TaskBatch, render_mode: str | None, size: tuple[int, int]) -> None:
+        """Wrap a batch; pictures have a width and a height [pixels]."""
+        self.batch, self.max_episode_steps = batch, int(batch.max_episode_steps.max())
+        self._size, self.render_mode = render_arguments(render_mode, size), render_mode
+        self._renderers: dict[int, Renderer] = {}
+        self._final_states: dict[int, RenderState] = {}
+        self._spec: EnvSpec | None = None
+        self._running = False
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Specification of ``gym.make``, with ``max_episode_steps``; None without it."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None:
+            values = {each.name: getattr(spec, each.name) for each in fields(spec) if each.init}
+            limit = spec.max_episode_steps or self.max_episode_steps
+            self._spec = TextSpec(**values | {"max_episode_steps": limit})
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for a copy, which makes renderers anew."""
+        self._require_open()
+        return vars(self) | {"_renderers": {}}
+
+    def _require_open(self) -> None:
+        if self.closed:
+            raise TaskError("this environment is closed")
+
+    def _require_running(self) -> None:
+        self._require_open()
+        if not self._running:
+            raise TaskError("no episode is running; call reset()")
+
+    def _frames(self) -> tuple[Frame, ...] | None:
+        """Return a picture of each environment, at the end of its episode where one has ended."""
+        self._require_open()
+        if self.render_mode is None:
+            gym.logger.warn(
+                'nothing is rendered: make the environment with render_mode="rgb_array"'
+            )
+            return None
+        frames = []
+        for env, robot in enumerate(self.batch.env_robot_index.tolist()):
+            if robot not in self._renderers:
+                self._renderers[robot] = Renderer.of_spec(self.batch.specs[robot], self._size)
+            state = self._final_states.get(env) or render_state(self.batch, env)
+            frames.append(self._renderers[robot].frame(state))
+        return tuple(frames)
+
+    def _step_batch(
+        self, actions: torch.Tensor, hold: torch.Tensor | None, *, keeps_ends: bool
+    ) -> Step:
+        """Step the batch, which begins the next episode where one ends.
+
+        Where the last state is wanted for a picture, it is kept.
+        """
+        is_shown = self.render_mode is not None and keeps_ends
+        count = self.batch.num_envs if is_shown else 0
+        before = [render_state(self.batch, env) for env in range(count)]
+        step = self.batch.step(actions, hold)
+        self._final_states = {
+            env: replace(
+                state,
+                q=step.q[env, : len(state.q)].cpu().numpy(),
+                block=None if state.block is None else step.block_pose[env].cpu().numpy(),
+            )
+            for env, state in enumerate(before)
+            if step.terminated[env] or step.truncated[env]
+        }
+        return step
+
+    def _free(self) -> None:
+        self.batch.close()
+        for renderer in self._renderers.values():
+            renderer.close()
+
+
+class TaskVector(BatchEnv, VectorEnv[NumpyObservation, Array, Array]):
     """A batch with a NumPy interface. It owns the batch: ``close`` frees it.
 
     Observations are those of ``TaskBatch``, float32; masks are int8, with at least one axis; empty
@@ -177,17 +264,11 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
     ended; with ``NEXT_STEP`` all that have acted.
 
     Attributes:
-        batch: The batch.
         autoreset_mode: When the next episode begins.
         action_links: Links whose joints the entries of an action move, K indices below L.
-        max_episode_steps: Time limit of episodes, of the longest if tasks differ [control steps].
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012
-        "autoreset_mode": AutoresetMode.SAME_STEP,
-        "render_modes": list(RENDER_MODES),
-        "render_fps": round(1 / CONTROL_PERIOD),
-    }
+    metadata = BatchEnv.metadata | {"autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(
         self,
@@ -198,15 +279,11 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
         size: tuple[int, int] = SIZE,
     ) -> None:
         """Wrap a batch; pictures have a width and a height [pixels]."""
-        self.batch, self.num_envs = batch, batch.num_envs
+        self._wrap(batch, render_mode, size)
+        self.num_envs = batch.num_envs
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.metadata = type(self).metadata | {"autoreset_mode": self.autoreset_mode}
-        self._size, self.render_mode = render_arguments(render_mode, size), render_mode
-        self._renderers: dict[int, Renderer] = {}
-        self._final_states: dict[int, RenderState] = {}
-        self._spec: EnvSpec | None = None
-        self._running, self._ended = False, np.zeros(self.num_envs, dtype=np.bool_)
-        self.max_episode_steps = int(batch.max_episode_steps.max())
+        self._ended = np.zeros(self.num_envs, dtype=np.bool_)
         has_action, is_link = batch.action_mask.any(dim=0), batch.observe()["links"].any(dim=0)
         self.action_links: tuple[int, ...] = tuple(torch.nonzero(has_action)[:, 0].tolist())
         links = slice(int(torch.nonzero(is_link).max()) + 1)
@@ -246,23 +323,17 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
 
     def step(self, actions: Array) -> tuple[NumpyObservation, Array, Array, Array, dict[str, Any]]:
         """Act for one control step."""
-        self._require_open()
-        if not self._running:
-            raise TaskError("no episode is running; call reset()")
+        self._require_running()
         held = torch.from_numpy(self._ended.copy()) if self._ended.any() else None
-        device = self.batch.device
-        is_shown = self.render_mode is not None and self.autoreset_mode is AutoresetMode.NEXT_STEP
-        before = [render_state(self.batch, env) for env in range(self.num_envs)] if is_shown else []
-        step = self.batch.step(self._padded(actions), None if held is None else held.to(device))
+        hold = None if held is None else held.to(self.batch.device)
+        keeps_ends = self.autoreset_mode is AutoresetMode.NEXT_STEP
+        step = self._step_batch(self._padded(actions), hold, keeps_ends=keeps_ends)
         terminated, truncated = _numpy(step.terminated), _numpy(step.truncated)
         over = terminated | truncated
         reward = _numpy(step.reward)
-        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+        if keeps_ends:
             acted, self._ended = ~self._ended, over
             observation = self._numpy(step.observation)
-            self._final_states = {
-                env: final_state(state, step, env) for env, state in enumerate(before) if over[env]
-            }
             if over.any():
                 last = self._numpy(step.final_observation)
                 for name, values in observation.items():
@@ -283,43 +354,11 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
 
         With ``NEXT_STEP`` an environment whose episode has ended shows its end.
         """
-        self._require_open()
-        if self.render_mode is None:
-            gym.logger.warn(
-                'nothing is rendered: make the environments with render_mode="rgb_array"'
-            )
-            return None
-        frames = []
-        for env, robot in enumerate(self.batch.env_robot_index.tolist()):
-            if robot not in self._renderers:
-                self._renderers[robot] = Renderer.of_spec(self.batch.specs[robot], self._size)
-            state = self._final_states.get(env) or render_state(self.batch, env)
-            frames.append(self._renderers[robot].frame(state))
-        return tuple(frames)
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """Specification of ``gym.make_vec``, with ``max_episode_steps``; None without it."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = text_spec(spec, self.max_episode_steps)
+        return self._frames()
 
     def close_extras(self, **kwargs: object) -> None:
         """Free the batch."""
-        self.batch.close()
-        for renderer in self._renderers.values():
-            renderer.close()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a copy, which makes renderers anew."""
-        self._require_open()
-        return vars(self) | {"_renderers": {}}
-
-    def _require_open(self) -> None:
-        if self.closed:
-            raise TaskError("these environments are closed")
+        self._free()
 
     def _padded(self, actions: Array) -> torch.Tensor:
         """Return actions for all links, shape (n, L)."""
@@ -339,12 +378,6 @@ class TaskVector(VectorEnv[NumpyObservation, Array, Array]):
             name: values[:, self._columns[name]] if name in self._columns else values
             for name, values in numpy_observation(observation).items()
         }
-
-
-def final_state(before: RenderState, step: Step, env: int = 0) -> RenderState:
-    """Return the last state of an episode: a batch has begun the next when a step returns."""
-    block = None if before.block is None else step.block_pose[env].cpu().numpy()
-    return replace(before, q=step.q[env, : len(before.q)].cpu().numpy(), block=block)
 
 
 def task_vector(

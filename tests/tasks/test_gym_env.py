@@ -835,7 +835,7 @@ def test_making_vectors_shows_progress_and_closed_ones_raise_a_clear_error():
     envs.close()
     envs.close()
     for use in (envs.reset, lambda: envs.step(envs.action_space.sample())):
-        with pytest.raises(TaskError, match="these environments are closed"):
+        with pytest.raises(TaskError, match="this environment is closed"):
             use()
 
 

@@ -105,7 +105,7 @@ def test_block_and_ground_line_are_drawn_at_their_positions(on, push):
 def test_obstacles_are_drawn(on, reach):
     bare = replace(reach, scene=replace(reach.scene, obstacles=()))
     q = reach.goals.q[0]
-    points = on(reach)._model.points
+    points = on(reach).points
     drawing = on(bare)
     drawing._camera = renderer._camera(points, SIZE[0] / SIZE[1])
     frame = on(reach).frame(RenderState(q))
@@ -117,7 +117,7 @@ def test_obstacles_are_drawn(on, reach):
 @pytest.mark.parametrize("name", ["reach", "push"])
 def test_camera_frames_the_whole_scene(name, request):
     """The test projects points itself, from the position and axes of the camera."""
-    points = Renderer.of_spec(request.getfixturevalue(name))._model.points
+    points = Renderer.of_spec(request.getfixturevalue(name)).points
     camera = renderer._camera(points, 4 / 3)
     azimuth, elevation = np.radians([camera.azimuth, camera.elevation])
     flat = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])

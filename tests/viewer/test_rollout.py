@@ -282,7 +282,7 @@ def test_a_web_page_plays_the_episode(beginning):
 
 def test_video_camera_frames_the_whole_episode(episode):
     track = episode.tracks[0]
-    points = make_renderer(track, (64, 48))._model.points
+    points = make_renderer(track, (64, 48)).points
     low, high = points.min(axis=0), points.max(axis=0)
     tools = frame_pose(track.robot, np.array(track.q))[:, :3, 3]
     for point in (track.marker_poses["goal"][0][:3], tools[-1]):
