@@ -76,7 +76,9 @@ class NumpyStepper:
         self._normalized = np.zeros(batch.action_mask.shape[1], np.float32)
         self._episode_step = batch.episode_step.numpy()
         self._max_episode_steps = int(batch.max_episode_steps[0])
-        self._view_state()
+        simulation = batch.simulation
+        tensors = simulation.q, simulation.qd, simulation.block_pose
+        self._q, self._qd, self._block_pose = (tensor[0].numpy() for tensor in tensors)
         self._constant: NumpyObservation = {}
         self._requested: Callable[[], NumpyObservation] = dict
 
@@ -130,16 +132,7 @@ class NumpyStepper:
         if diverged:
             simulation.reset(mask, torch.from_numpy(q[None]), torch.from_numpy(block_pose[None]))
             self._motion.previous_qd[:] = 0
-        seen, simulated = self._tensors, (simulation.q, simulation.qd, simulation.block_pose)
-        if not (seen[0] is simulated[0] and seen[1] is simulated[1] and seen[2] is simulated[2]):
-            self._view_state()  # a simulator may replace its tensors
         return diverged
-
-    def _view_state(self) -> None:
-        """Take views of the simulation's tensors."""
-        simulation = self._batch.simulation
-        self._tensors = simulation.q, simulation.qd, simulation.block_pose
-        self._q, self._qd, self._block_pose = (tensor[0].numpy() for tensor in self._tensors)
 
     def _tool(self) -> Array:
         """Return the position of the tool, shape (3,) [m]."""

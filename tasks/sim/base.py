@@ -86,8 +86,8 @@ class Simulation(ABC):
     """Environments with a scene each, stepped together.
 
     Tensors are on ``device``; numbers are float32, padded with zeros to the largest number of
-    independent joints, J. They are views that the next call may overwrite. Environments do not
-    influence each other: each gives the same numbers whatever else is in the batch.
+    independent joints, J. They are updated in place. Environments do not influence each other: each
+    gives the same numbers whatever else is in the batch.
 
     On a GPU, ``reset`` and ``step`` read no tensor, so that the caller never waits for them.
 

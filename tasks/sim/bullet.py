@@ -47,9 +47,6 @@ class BulletSimulation(HostSimulation):
     ) -> None:
         """Load every scene."""
         super().__init__(scenes)
-        n, joints = self._targets.shape
-        self._state = tuple(np.zeros((n, width), np.float32) for width in (joints, joints, 7, 3))
-        self.q, self.qd, self.block_pose, self._block_velocity = map(torch.from_numpy, self._state)
         self.workers: list[Worker] = []
         self._unreset: set[int] = set()
         resources = ExitStack()
@@ -65,7 +62,7 @@ class BulletSimulation(HostSimulation):
                     [scenes[env] for env in envs],
                     contacts or Contacts(),
                     [exported[env] for env in envs],
-                    joints,
+                    self._targets.shape[1],
                 )
                 for envs in shares
             )
@@ -74,6 +71,13 @@ class BulletSimulation(HostSimulation):
                 resources.callback(self.workers[-1].end)
             self.batch = BulletBatch(first)
             resources.callback(self.batch.close)
+            self._state: Any = self.batch.state
+            if self.workers:
+                self._state = [
+                    np.zeros((len(scenes), *part.shape[1:]), np.float32) for part in self._state
+                ]
+            tensors = map(torch.from_numpy, self._state)
+            self.q, self.qd, self.block_pose, self._block_velocity = tensors
             for worker in self.workers:
                 worker.receive()
             self._go_home()
@@ -136,8 +140,9 @@ class BulletSimulation(HostSimulation):
             raise
         found: dict[int, str] = {}
         for envs, rows, (faults, state) in zip(self._shares, self._rows, answers, strict=True):
-            for values, of_share in zip(self._state, state, strict=True):
-                values[rows] = of_share
+            if self.workers:
+                for values, of_share in zip(self._state, state, strict=True):
+                    values[rows] = of_share
             if faults:
                 found |= {int(envs[i]): reason for i, reason in faults.items()}
         return found

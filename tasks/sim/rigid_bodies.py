@@ -10,7 +10,7 @@ from morphgen.checks.self_collision import untested_pairs
 from morphgen.model.geometry import IDENTITY, Pose
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Inertial, Link, Robot, sorted_pair
-from morphgen.model.tree import rigid_groups
+from morphgen.model.tree import rename, rigid_groups, take_name
 
 _Piece = tuple[Pose, Link]  # pose of a link in the link that it is merged into, and the link
 _UPRIGHT = 1e-6
@@ -62,44 +62,24 @@ def merge_rigid_links(robot: Robot) -> Robot:
         for a, b in ignored
         if merged_name[a] != merged_name[b]
     }
-    links = tuple(_merged_link(name, parts) for name, parts in pieces.items())
-    return _with_own_root(
-        Robot(robot.name, links, tuple(joints), home=robot.home, ignore_pairs=tuple(sorted(pairs)))
+    links = tuple(
+        Link(
+            name,
+            _merged_inertial(parts),
+            collisions=tuple(
+                replace(shape, T_link_shape=T @ shape.T_link_shape)
+                for T, link in parts
+                for shape in link.collisions
+            ),
+        )
+        for name, parts in pieces.items()
     )
-
-
-def _with_own_root(robot: Robot) -> Robot:
-    """Return the robot with a root named ``world`` renamed.
-
-    MuJoCo reserves that name, and an MJCF cannot give the link the mass of those welded to it.
-    """
-    if robot.root.name != "world":
-        return robot
-    root = "world_"
-    while root in robot.link_index:
-        root += "_"
-
-    def renamed(name: str) -> str:
-        return root if name == "world" else name
-
-    return replace(
-        robot,
-        links=(replace(robot.root, name=root), *robot.links[1:]),
-        joints=tuple(replace(joint, parent=renamed(joint.parent)) for joint in robot.joints),
-        frames=tuple(replace(frame, link=renamed(frame.link)) for frame in robot.frames),
-        ignore_pairs=tuple(
-            sorted(sorted_pair(renamed(a), renamed(b)) for a, b in robot.ignore_pairs)
-        ),
+    merged = Robot(
+        robot.name, links, tuple(joints), home=robot.home, ignore_pairs=tuple(sorted(pairs))
     )
-
-
-def _merged_link(name: str, pieces: list[_Piece]) -> Link:
-    collisions = tuple(
-        replace(shape, T_link_shape=T @ shape.T_link_shape)
-        for T, link in pieces
-        for shape in link.collisions
-    )
-    return Link(name, _merged_inertial(pieces), collisions=collisions)
+    # MuJoCo reserves this name: an MJCF cannot give the link the mass of those welded to it.
+    names = {"world": take_name("world", {*merged.link_index})}
+    return rename(merged, names) if merged.root.name == "world" else merged
 
 
 def _merged_inertial(pieces: list[_Piece]) -> Inertial | None:

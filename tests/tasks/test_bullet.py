@@ -322,16 +322,6 @@ def test_workers_are_bit_identical_to_one_process(workers):
     alone.close()
 
 
-def test_invalid_arguments_do_not_stop_the_workers(workers):
-    q = reset(workers)
-    with pytest.raises(ValueError, match=r"environment 0 .*targets"):
-        workers.step(q * torch.nan)
-    with pytest.raises(ValueError, match="shape"):
-        workers.step(q[:1])
-    workers.step(q)
-    assert workers.q[0, : workers.scenes[0].robot.dof].any()
-
-
 @pytest.mark.parametrize("heavy", [{0}, {1}, {0, 1}], ids=["here", "in a worker", "both"])
 def test_diverged_environments_are_reported_and_the_others_step(heavy):
     """The block's weight is not finite."""

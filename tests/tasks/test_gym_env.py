@@ -535,22 +535,19 @@ REGISTERED = (
     "assert gymnasium.spec('morphgen/Push-v0').entry_point\n"
     "from morphgen.tasks.registry import register_gym_envs; register_gym_envs()\n"
 )
+UNLOADED = "assert not {'gymnasium', 'numpy', 'torch'} & {*sys.modules}\n"
 
 
 @pytest.mark.parametrize(
-    ("imports", "holds"),
+    "script",
     [
-        ("import gymnasium, morphgen.tasks", REGISTERED),
-        ("import morphgen, gymnasium, morphgen.tasks", REGISTERED),
-        ("import morphgen.tasks, gymnasium, morphgen.tasks.gym.env", REGISTERED),
-        (
-            "import sys, morphgen.tasks",
-            "assert not {'gymnasium', 'numpy', 'torch'} & {*sys.modules}",
-        ),
+        f"import gymnasium, morphgen.tasks\n{REGISTERED}",
+        f"import sys, morphgen.tasks\n{UNLOADED}"
+        f"import gymnasium, morphgen.tasks.gym.env\n{REGISTERED}",
     ],
 )
-def test_imports_register_the_ids_and_load_no_heavy_package(imports, holds):
-    subprocess.run([sys.executable, "-W", "error", "-c", f"{imports}\n{holds}"], check=True)
+def test_imports_register_the_ids_and_load_no_heavy_package(script):
+    subprocess.run([sys.executable, "-W", "error", "-c", script], check=True)
 
 
 @pytest.fixture

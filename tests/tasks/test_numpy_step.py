@@ -206,21 +206,6 @@ def test_divergence_is_undone_as_in_the_batch(make):
     assert_observation_equals(env.reset()[0], env, step.observation)
 
 
-def test_simulators_may_replace_their_tensors(make):
-    env, batch = make("reach")
-
-    class Replacing:
-        def __init__(self, simulation):
-            self.simulation = simulation
-
-        def __getattr__(self, name):
-            value = getattr(self.simulation, name)
-            return value.clone() if isinstance(value, torch.Tensor) else value
-
-    env.batch.simulation = Replacing(env.batch.simulation)
-    run_both(env, batch, 1)
-
-
 def test_classes_that_change_a_step_in_torch_step_in_torch(make):
     class Changed(ReachEnvs):
         def evaluate(self, state):
