@@ -9,12 +9,12 @@ from typing import Any
 
 import yaml
 
-from morphgen.benchmark.regimes import NOTHING
+from morphgen.benchmark.regimes import parts as part_names
 from morphgen.benchmark.texts import read_text
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
-from morphgen.splits.split import SIDES, Split
+from morphgen.splits.split import SIDES, Split, sided_members
 
 UNKNOWN = "unknown"  # restriction of a licence that is not listed
 _SPDX = "https://spdx.org/licenses/{}.html"
@@ -85,13 +85,11 @@ def find_licence(identifier: str) -> Licence:
 
 def licenced_parts(split: Split, library: Library) -> tuple[LicencedPart, ...]:
     """Return the parts of a split's robots with their licences, sorted by licence and name."""
-    robots: dict[str, dict[tuple[str, str], None]] = {}
-    for side in SIDES:
-        for member in split.side(side):
-            derivation = parse_derivation(member.derivation, f"derivation of {member.name!r}")
-            for node in derivation.walk():
-                if node.part != NOTHING:
-                    robots.setdefault(node.part, {})[side, member.name] = None
+    robots: dict[str, list[tuple[str, str]]] = {}
+    for side, member in sided_members(split):
+        derivation = parse_derivation(member.derivation, f"derivation of {member.name!r}")
+        for part in part_names(derivation):
+            robots.setdefault(part, []).append((side, member.name))
     manifests = {part: library.manifest(part) for part in robots}
     found = [
         LicencedPart(part, find_licence(manifests[part].licence), manifests[part].citation, (*who,))

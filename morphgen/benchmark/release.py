@@ -34,7 +34,7 @@ import msgspec
 import yaml
 
 from morphgen.benchmark.audit import Audit, audit_survey
-from morphgen.benchmark.eval_protocol import EvalProtocol
+from morphgen.benchmark.eval_protocol import EvalProtocol, tasks_of_split
 from morphgen.benchmark.licences import (
     LicencedPart,
     find_licence,
@@ -339,7 +339,7 @@ def _front_matter(split: Split, release: Release, parts: Sequence[LicencedPart])
     # Several licences may have one identifier there, such as gpl-3.0.
     ids = list(dict.fromkeys(find_licence(each).hub_id for each in licence_ids(parts)))
     robots = len(split.train) + len(split.test)
-    tasks = sorted({member.task for side in SIDES for member in split.side(side)})
+    tasks = sorted(tasks_of_split(split))
     data = {
         "pretty_name": f"{release.name} {release.version}",
         "license": ids[0] if len(ids) == 1 else ids,

@@ -4,8 +4,22 @@ import shutil
 
 import pytest
 
+from helpers.caching import once
 from helpers.splits import LIBRARY, combined
+from morphgen.benchmark import survey
 from morphgen.benchmark.split_folder import BUNDLED, BuildSettings, build_split
+from morphgen.splits.candidates import RobotFactory
+
+
+@pytest.fixture(scope="module")
+def composed_once():
+    """Compose and measure each robot once in a module whose tests draw from the same few."""
+    with pytest.MonkeyPatch.context() as patch:
+        make = once(RobotFactory.__call__, lambda self, recipe: (self.max_links, repr(recipe)))
+        patch.setattr(RobotFactory, "__call__", make)
+        measure = once(survey.survey_robot, lambda _, max_links, member: (max_links, member))
+        patch.setattr(survey, "survey_robot", measure)
+        yield
 
 
 @pytest.fixture

@@ -18,6 +18,8 @@ from morphgen.benchmark.regimes import expand, parts, regime_findings, structure
 from morphgen.errors import BenchmarkError, CompositionError, PartError
 from morphgen.grammar.derivation import parse_derivation
 
+pytestmark = pytest.mark.usefixtures("composed_once")
+
 FROM = ["arm={ur5,lwr,xarm7} ee={plane,stick,cylinder}"]
 
 

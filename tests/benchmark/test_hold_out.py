@@ -5,11 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from helpers.caching import once
 from helpers.generated_splits import LIBRARY, order
 from helpers.grammars import grammar, shipped
 from helpers.splits import member, split
-from morphgen.benchmark import survey
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.hold_out import (
     held_out_parts,
@@ -28,21 +26,12 @@ from morphgen.splits.candidates import RobotFactory
 from morphgen.splits.split import Member, compose_member, split_id
 from morphgen.splits.split_file import parse_split, split_text
 
+pytestmark = pytest.mark.usefixtures("composed_once")
+
 ARMS = ("arm3", "arm5", "arm_ed", "lwr")
 EES = ("cube", "cylinder", "plane", "sphere", "stick")
 PRIMITIVE = f"arm={{{','.join(ARMS)}}} ee={{{','.join(EES)}}}"
 """Twenty robots without meshes, which are fast to compose."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _robots_are_composed_once():
-    """Most tests draw from the same twenty robots."""
-    with pytest.MonkeyPatch.context() as patch:
-        make = once(RobotFactory.__call__, lambda self, recipe: (self.max_links, repr(recipe)))
-        patch.setattr(RobotFactory, "__call__", make)
-        measure = once(survey.survey_robot, lambda _, max_links, member: (max_links, member))
-        patch.setattr(survey, "survey_robot", measure)
-        yield
 
 
 def made(rules, *train, patterns=(PRIMITIVE,), grammars=(), **changes):
