@@ -82,10 +82,6 @@ def goal_set(
     A set depends on what ``goal_set_key`` says. A smaller set is the beginning of a larger one.
     The ground is a height in the root frame [m].
     """
-    if seed < 0 or config.num_goals < 1:
-        raise BenchmarkError(
-            f"{config.num_goals} goals with seed {seed}: at least one goal, and no negative seed"
-        )
     task.check(robot, config)
     key = goal_set_key(robot, task, config, obstacles=obstacles, seed=seed, ground=ground)
     if shipped is not None:

@@ -76,10 +76,8 @@ def draw_boxes(
     shoulder (``workspace``), which depends neither on a pedestal nor on the position of a rail.
     """
     low, high = size
-    if count < 1 or not 0 < low <= high < math.inf:
-        raise BenchmarkError(
-            f"{count} obstacles of size {size}: at least one, and 0 < lowest <= highest"
-        )
+    if count < 1:
+        raise BenchmarkError(f"{count} obstacles: expected at least one")
     _, reach = tool_reach(robot)
     edges = (rng.uniform(low, high, (count, 3)) * reach).tolist()
     return tuple(Block((a, b, c)) for a, b, c in edges)

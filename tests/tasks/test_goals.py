@@ -21,6 +21,7 @@ from morphgen.tasks.push.starts import CLOSE, path_is_clear, push_region
 from morphgen.tasks.reach import task as module
 from morphgen.tasks.reach.task import REACH
 from morphgen.tasks.scenes import obstacles
+from morphgen.tasks.scenes.env_specs import GoalConfig
 from morphgen.tasks.scenes.obstacles import (
     KEPT,
     draw_boxes,
@@ -126,12 +127,9 @@ def test_missing_room_for_obstacles_is_an_error(body, folder):
     assert not folder.exists()
 
 
-@pytest.mark.parametrize(
-    ("count", "size"), [(0, (0.1, 0.2)), (1, (0.0, 0.1)), (1, (0.2, 0.1)), (1, (0.1, np.inf))]
-)
-def test_invalid_obstacles_are_rejected(body, count, size):
-    with pytest.raises(BenchmarkError, match=f"{count} obstacles of size"):
-        draw_boxes(body, count, size, np.random.default_rng(0))
+def test_no_obstacles_are_rejected_where_there_shall_be_some(body, folder):
+    with pytest.raises(BenchmarkError, match="0 obstacles: expected at least one"):
+        sample_goals(body, folder, obstacles=True, config=replace(CONFIG, obstacles=0))
 
 
 def test_cache_key_depends_on_exactly_the_relevant_inputs(body, folder):
@@ -465,5 +463,5 @@ def test_obstacles_that_block_every_push_are_an_error(tmp_path, monkeypatch):
 def test_invalid_pushes_are_rejected(changes, text, cache):
     with pytest.raises((TaskError, BenchmarkError), match=text):
         sample_starts("prims", cache, config=replace(PUSH, **changes))
-    with pytest.raises(BenchmarkError, match="with seed -1"):
-        sample_starts("prims", cache, seed=-1)
+    with pytest.raises(TaskError, match="goal seed -1: expected a whole number, 0 or more"):
+        GoalConfig(-1)
