@@ -20,8 +20,9 @@ from morphgen.tasks.registry import TASKS
 from morphgen.viewer.episode import episode_bytes, read_episode
 from morphgen.viewer.pages.play import default_policy
 from morphgen.viewer.robot_uri import FileAccess
-from morphgen.viewer.rollout import Rollout, RolloutConfig
+from morphgen.viewer.rollout import RolloutConfig
 from morphgen.viewer.scene.rollout import episode_page
+from morphgen.viewer.simulation import Rollout
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 CUSTOM_TASK = EXAMPLES / "09_custom_task.py"
@@ -125,12 +126,12 @@ def test_external_task_can_be_trained_played_and_viewed(follow, tmp_path, capsys
     rollout.close()
     (track,) = rollout.episode.tracks
     assert track.num_steps == 200
-    goals = np.array(track.marker_poses["goal"])
+    goals = np.array(track.poses["goal"])
     assert goals.shape == (201, 7)
     assert np.linalg.norm(goals[100, :2] - goals[0, :2]) == pytest.approx(0.1, abs=1e-3)
     (tmp_path / "episode.npz").write_bytes(episode_bytes(rollout.episode))
     read = read_episode(tmp_path / "episode.npz", places).tracks[0]
-    assert np.array_equal(read.marker_poses["goal"], goals)
+    assert np.array_equal(read.poses["goal"], goals)
     assert episode_page(rollout.episode, dark=False)
 
 

@@ -50,6 +50,9 @@ from morphgen.viewer.robot_uri import FileAccess, read_robot_uri
 Array = NDArray[np.float32]
 
 FORMAT = 2
+BLOCK = "block"  # name of the block among the poses of a track
+_OF_STEPS = ("score", "distance", "success")  # values of a track that every step has
+STRIDE = 2  # control steps between two frames of a film
 
 
 @dataclass(frozen=True)
@@ -101,9 +104,8 @@ class Track:
     markers: tuple[Marker, ...] = ()  # shapes that show the goal
     block_size: tuple[float, float, float] | None = None
     q: list[Array] = field(default_factory=list)  # positions (J,) at the start and every step
-    block: list[Array] = field(default_factory=list)  # poses at the same times, if there is one
-    marker_poses: dict[str, list[Array]] = field(default_factory=dict)
-    """Poses of each marker at the start and after every step, by name."""
+    poses: dict[str, list[Array]] = field(default_factory=dict)
+    """Poses at the same times of each marker by its name, and of the ``block`` if there is one."""
     score: list[float] = field(default_factory=list)
     distance: list[float] = field(default_factory=list)
     success: list[bool] = field(default_factory=list)
@@ -113,6 +115,22 @@ class Track:
     def num_steps(self) -> int:
         """Control steps so far."""
         return len(self.q) - 1
+
+    def recorded(self, after: int = -1) -> dict[str, Any]:
+        """Return copies of the lists after a number of steps, by default with the start."""
+        last = min(self.num_steps, len(self.score))
+        moments, steps = slice(after + 1, last + 1), slice(max(after, 0), last)
+        lists: dict[str, Any] = {"q": self.q[moments]}
+        lists["poses"] = {name: poses[moments] for name, poses in self.poses.items()}
+        return lists | {name: getattr(self, name)[steps] for name in _OF_STEPS}
+
+    def extend(self, lists: Mapping[str, Any]) -> None:
+        """Append what ``recorded`` of the same robot has returned."""
+        for name, poses in lists["poses"].items():
+            self.poses[name] += poses
+        # Last, because other threads read a track up to the length of q meanwhile.
+        for name in (*_OF_STEPS, "q"):
+            getattr(self, name).extend(lists[name])
 
 
 @dataclass(eq=False)
@@ -132,6 +150,11 @@ class Episode:
         """Control steps so far of the longest track."""
         return max((track.num_steps for track in self.tracks), default=0)
 
+    @property
+    def film_steps(self) -> list[int]:
+        """Steps that a film shows: the start, every ``STRIDE`` steps, and the end."""
+        return [*range(0, self.num_steps, STRIDE), self.num_steps]
+
 
 def score_until(track: Track, task: str, step: int) -> float | None:
     """Return an episode's score as if it had ended after a number of steps; None at the start.
@@ -146,15 +169,7 @@ def score_until(track: Track, task: str, step: int) -> float | None:
 
 def snapshot(episode: Episode) -> Episode:
     """Return a copy of an episode that does not grow while the simulation continues."""
-    tracks = []
-    for track in episode.tracks:
-        n = min(track.num_steps, len(track.score))
-        at_moments: dict[str, Any] = {"q": track.q[: n + 1], "block": track.block[: n + 1]}
-        of_steps: dict[str, Any] = {
-            name: getattr(track, name)[:n] for name in ("score", "distance", "success")
-        }
-        poses = {name: poses[: n + 1] for name, poses in track.marker_poses.items()}
-        tracks.append(replace(track, marker_poses=poses, **at_moments, **of_steps))
+    tracks = [replace(track, **track.recorded()) for track in episode.tracks]
     return replace(episode, tracks=tracks)
 
 
@@ -230,10 +245,8 @@ def _arrays(track: Track) -> dict[str, NDArray[Any]]:
         "distance": np.array(track.distance[:n], dtype=np.float32),
         "success": np.array(track.success[:n], dtype=np.bool_),
     }
-    for name, poses in track.marker_poses.items():
+    for name, poses in track.poses.items():
         arrays[name] = np.array(poses[: n + 1], dtype=np.float32)
-    if track.block:
-        arrays["block"] = np.array(track.block[: n + 1], dtype=np.float32)
     return arrays
 
 
@@ -244,12 +257,12 @@ def _track(body: _Body, arrays: Mapping[str, NDArray[Any]], files: FileAccess) -
         raise EpisodeError(
             f"the robot at {body.place} is not the one that was recorded: it has changed since"
         )
-    q, block = arrays["q"], arrays["block"] if body.block else None
+    q = arrays["q"]
     if q.ndim != 2 or not len(q):
         raise ValueError(f"q has shape {q.shape}; expected ({robot.dof},) for every moment")
-    poses = [marker.name for marker in body.markers] + ["block"] * (block is not None)
+    poses = [marker.name for marker in body.markers] + [BLOCK] * (body.block is not None)
     _require(arrays, {"q": (len(q), robot.dof), **dict.fromkeys(poses, (len(q), 7))})
-    _require(arrays, dict.fromkeys(("score", "distance", "success"), (len(q) - 1,)))
+    _require(arrays, dict.fromkeys(_OF_STEPS, (len(q) - 1,)))
     return Track(
         robot,
         body.place,
@@ -258,8 +271,7 @@ def _track(body: _Body, arrays: Mapping[str, NDArray[Any]], files: FileAccess) -
         body.markers,
         body.block,
         list(q.astype(np.float32)),
-        [] if block is None else list(block.astype(np.float32)),
-        {marker.name: list(arrays[marker.name].astype(np.float32)) for marker in body.markers},
+        {name: list(arrays[name].astype(np.float32)) for name in poses},
         arrays["score"].tolist(),
         arrays["distance"].tolist(),
         [bool(success) for success in arrays["success"]],

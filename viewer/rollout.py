@@ -1,47 +1,22 @@
-"""Episodes that are being simulated: robots at a task, each in an environment of its own."""
+"""Playback of episodes: their sources, and the player that shows them in one browser."""
 
 from __future__ import annotations
 
-import contextlib
 import itertools
+import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable
+from concurrent.futures import CancelledError, Future
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
-
-import numpy as np
-import torch
+from typing import Any, Protocol
 
 from morphgen.errors import MorphgenError, TaskError, nearest
-from morphgen.fitting.replace_collision import as_primitives
-from morphgen.formats.bundle import split_colours
-from morphgen.grammar.grammar_file import SUFFIX
-from morphgen.grammar.robot_source import is_robot_file
-from morphgen.rl.baselines import BASELINES, Controller
-from morphgen.rl.inference import ControllerSpec, make_env_and_controller, read_controller
-from morphgen.rl.runs.checkpoint import read_checkpoint
-from morphgen.rl.runs.robot_source import FILE, members, read_drawn
-from morphgen.rl.shipped_policies import is_named, policies_for
-from morphgen.tasks.gym.env import TaskEnv
-from morphgen.tasks.registry import TASKS, installed_simulators
-from morphgen.tasks.render.renderer import render_state
-from morphgen.tasks.scenes.env_specs import load_robot
-from morphgen.tasks.sim.base import CONTROL_PERIOD
-from morphgen.viewer.app.address import MAX_PLAYED
-from morphgen.viewer.episode import Array, Episode, Track
-from morphgen.viewer.robot_uri import (
-    CHECKPOINT,
-    DERIVATION,
-    WORDS,
-    FileAccess,
-    UriError,
-    read_robot_uri,
-    shorten,
-    uri_name,
-    with_library_meshes,
-)
+from morphgen.viewer.app.workers import Workers, named
+from morphgen.viewer.episode import Episode
+from morphgen.viewer.robot_uri import CHECKPOINT, FileAccess, UriError, shorten
 
 MAX_CHECKPOINTS = 50  # checkpoints that a page offers
 
@@ -74,78 +49,42 @@ class EpisodeSource:
         """Free the simulation."""
 
 
-@dataclass(eq=False)
-class _SimulatedRobot:
-    """A robot in its environment, and its track so far."""
-
-    env: TaskEnv
-    controller: Controller
-    track: Track
-    is_running: bool = True
+def simulation(function: str) -> Callable[..., Any]:
+    """Return a function of the module of simulations for their process."""
+    return named(f"morphgen.viewer.simulation:{function}")
 
 
-class Rollout(EpisodeSource):
-    """Robots under a policy; each has the episode of ``morphgen play`` with the same seed."""
+class RemoteRollout(EpisodeSource):
+    """A ``simulation.Rollout`` in the process of simulations, some steps ahead of what is shown."""
 
-    def __init__(
-        self,
-        config: RolloutConfig,
-        files: FileAccess,
-        progress: Callable[[str], object] = lambda text: None,
-    ) -> None:
+    def __init__(self, config: RolloutConfig, files: FileAccess, process: Workers) -> None:
         """Start an episode."""
-        faults: dict[str, MorphgenError] = {}
-        self._robots: list[_SimulatedRobot] = []
-        spec = _read_controller(config.policy, config.task, files)
-        for uri in config.robots[:MAX_PLAYED]:
-            progress(f"preparing {uri_name(uri)}")
-            try:
-                self._robots.append(_start_robot(config, uri, spec, files))
-            except MorphgenError as error:
-                faults[uri] = error
-        if not self._robots:
-            none = UriError("no robot is named: add one with &robot=")
-            raise next(iter(faults.values()), none)
-        episode = Episode(
-            config.task,
-            config.policy,
-            config.seed,
-            config.obstacles,
-            config.simulator,
-            CONTROL_PERIOD,
-            [robot.track for robot in self._robots],
-        )
-        max_steps = max(int(robot.env.batch.max_episode_steps[0]) for robot in self._robots)
-        super().__init__(episode, max_steps)
-        self.faults |= {uri: str(error) for uri, error in faults.items()}
+        self._process, self._key = process, secrets.token_hex(8)
+        source = process.result(process.submit(simulation("start"), self._key, config, files))
+        super().__init__(source.episode, source.max_steps)
+        self.faults = source.faults
+        self._next: Future[Any] | None = process.submit(simulation("advance"), self._key)
 
     def advance(self) -> bool:
-        """Simulate one control step of every running robot; return False if none is running."""
-        running = [robot for robot in self._robots if robot.is_running]
-        for robot in running:
-            _step(robot)
-        return bool(running)
+        """Take over the next steps; return False if no robot is running."""
+        if self._next is None:
+            return False
+        is_running, tracks = self._process.result(self._next)
+        self._next = None
+        for track, (lists, fault) in zip(self.episode.tracks, tracks, strict=True):
+            track.extend(lists)
+            track.fault = fault
+        if is_running:
+            self._next = self._process.submit(simulation("advance"), self._key)
+        return self._next is not None
 
     def close(self) -> None:
-        """Free the simulations."""
-        for robot in self._robots:
-            robot.env.close()
+        """Free the simulation."""
+        with suppress(RuntimeError):  # the viewer has ended, and the process with it
+            self._process.submit(simulation("close"), self._key)
 
 
-def simulators() -> list[str]:
-    """Return the names of the installed simulators, MuJoCo first."""
-    usable = installed_simulators(lambda simulator: "cpu" in simulator.devices)
-    return sorted(usable, key=lambda name: name != "mujoco")
-
-
-def _read_controller(policy: str, task: str, files: FileAccess) -> ControllerSpec:
-    """Return the controller that a page names."""
-    if not is_named(policy):
-        policy = str(_checkpoint_path(policy, policies_for(task), files))
-    return read_controller(policy, task)
-
-
-def _checkpoint_path(policy: str, baselines: Iterable[str], files: FileAccess) -> Path:
+def checkpoint_path(policy: str, baselines: Iterable[str], files: FileAccess) -> Path:
     """Return the file or run folder of a checkpoint."""
     try:
         return files.path(policy)
@@ -162,98 +101,6 @@ def list_checkpoints(files: FileAccess) -> list[str]:
     root = files.roots[0]
     paths = sorted((root / "runs").rglob(CHECKPOINT))
     return [path.relative_to(root).as_posix() for path in paths[:MAX_CHECKPOINTS]]
-
-
-def training_robots(policy: str, files: FileAccess) -> tuple[str, bool, list[tuple[str, str]]]:
-    """Return task, obstacles, and names and URIs of the robots of a checkpoint's training.
-
-    It has obstacles if any robot had, because then the policy observes them. There are no robots
-    if they were drawn and their list is missing.
-    """
-    path = _checkpoint_path(policy, BASELINES, files)
-    source = read_checkpoint(path)[0].source
-    rows = members(source)
-    if source.grammars:
-        folder = path if path.is_dir() else path.parent
-        rows = read_drawn(folder) if (folder / FILE).is_file() else ()
-        if not rows:
-            return str(source.task), source.obstacles, []
-    if rows:
-        robots = [(row.name, f"{DERIVATION}{row.derivation}") for row in rows]
-        return rows[0].task, any(row.obstacles for row in rows), robots
-    # The name comes from a file, so paths in it are read only through ``files``.
-    words = source.name.split()
-    if is_robot_file(source.name):
-        robot = read_robot_uri(source.name, files)
-    elif words and words[0].endswith(SUFFIX):
-        robot = read_robot_uri(WORDS + source.name, files)
-    else:
-        robot = load_robot(source.name, library=files.library_folders)
-    derivation = robot.provenance.get("derivation")
-    uri = f"{DERIVATION}{derivation}" if derivation else source.name
-    assert source.task is not None  # only a split has none, and its robots were returned above
-    return source.task, source.obstacles, [(source.name, uri)]
-
-
-def _start_robot(
-    config: RolloutConfig, uri: str, spec: ControllerSpec, files: FileAccess
-) -> _SimulatedRobot:
-    """Begin the episode of a robot in an environment of its own."""
-    robot = read_robot_uri(uri, files)
-    env, controller = make_env_and_controller(
-        spec,
-        as_primitives(with_library_meshes(robot, files.library), files.library_folders),
-        config.seed,
-        sim=config.simulator,
-        obstacles=config.obstacles,
-        library=files.library_folders,
-    )
-    with contextlib.ExitStack() as stack:
-        stack.callback(env.close)
-        env.batch.reset(config.seed)
-        start, env_spec = render_state(env.batch), env.env_spec
-        track = Track(
-            split_colours(robot),
-            uri,
-            env_spec.scene.ground,
-            env.batch.layouts.obstacles(0),
-            TASKS[env_spec.task].markers(env_spec.config, env_spec.goals),
-            env_spec.scene.block.size if env_spec.scene.block else None,
-            [start.q],
-            [] if start.block is None else [start.block],
-            {name: [pose] for name, pose in start.markers.items()},
-        )
-        stack.pop_all()  # keeps the environment open
-        return _SimulatedRobot(env, controller, track)
-
-
-def _step(robot: _SimulatedRobot) -> None:
-    """Simulate one control step; the robot stops at the end of its episode."""
-    batch, track = robot.env.batch, robot.track
-    try:
-        step = batch.step(robot.controller.act(batch))
-    except MorphgenError as error:
-        robot.is_running, track.fault = False, str(error)
-        return
-    if track.block:
-        track.block.append(_to_numpy(step.block_pose[0]))
-    ended = bool(step.terminated[0] | step.truncated[0])
-    for name, pose in batch.groups.marker_poses(0).items():
-        poses = track.marker_poses[name]
-        # A batch resets an environment that ends, so its markers are those of the next episode.
-        poses.append(poses[-1] if ended else pose)
-    track.score.append(float(step.score[0]))
-    track.distance.append(float(step.distance[0]))
-    track.success.append(bool(step.success[0]))
-    # Last, because other threads read a track up to the length of q meanwhile.
-    track.q.append(_to_numpy(step.q[0, : track.robot.dof]))
-    robot.is_running = not ended
-    if step.diverged[0]:
-        track.fault = "the simulation diverged"
-
-
-def _to_numpy(values: torch.Tensor) -> Array:
-    return np.array(values.cpu().numpy(), dtype=np.float32)
 
 
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)  # speeds of playback [simulated seconds per second]
@@ -389,7 +236,7 @@ class Player:
         except MorphgenError as error:
             self.is_playing = False
             self._display.show_failure(str(error))
-        except (RuntimeError, TimeoutError):
+        except (CancelledError, RuntimeError, TimeoutError):
             if not self._ended:  # expected from a browser that has disconnected
                 raise
 

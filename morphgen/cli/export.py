@@ -88,7 +88,7 @@ def _html(robot: Robot, args: argparse.Namespace) -> bytes:
 
 
 def _video(robot: Robot, args: argparse.Namespace) -> bytes:
-    from morphgen.viewer.scene.robot import turntable  # of an extra, and seconds to import
+    from morphgen.viewer.film import turntable  # of an extra, and seconds to import
 
     return turntable(robot, f".{args.format}")
 

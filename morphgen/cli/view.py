@@ -41,8 +41,12 @@ def _wait(host: str, viewer: Viewer) -> None:
             )
         name = f"[{host}]" if ":" in host else host
         print(f"http://{name}:{viewer.port}  (stop with Ctrl-C)", flush=True)
+        is_warm = False
         while True:  # a signal that another thread receives does not end a sleep
             time.sleep(SIGNAL_POLL)
+            if viewer.sessions and not is_warm:
+                viewer.warm_up()
+                is_warm = True
     finally:
         for signal_name in (signal.SIGINT, *STOP_SIGNALS):
             signal.signal(signal_name, signal.SIG_IGN)  # a second one would leave uploads behind

@@ -16,7 +16,7 @@ from morphgen.splits.split import Member
 from morphgen.splits.split_file import write_split
 from morphgen.tasks.scenes.env_specs import GoalConfig
 from morphgen.viewer.robot_uri import DERIVATION, FileAccess
-from morphgen.viewer.rollout import training_robots
+from morphgen.viewer.simulation import training_robots
 
 FEW = ("--agent", "me-mlp", "--train-goals", "3", "--no-tensorboard", *SMALL)
 RUN = ("train", "task=reach", *FEW, "--robots")

@@ -9,9 +9,10 @@ import pytest
 
 from helpers.robots import arm
 from helpers.viser_client import PlainClient
+from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
 from morphgen.rl.runs.robot_source import RobotSource
-from morphgen.viewer import rollout
+from morphgen.viewer import simulation
 
 WORD = "tellnobody"
 DEEP = "a=b[c:" * 1000 + "a=b" + "]" * 1000
@@ -126,16 +127,15 @@ def test_grammar_text_cannot_include_files(shared_viewer, secret):
         assert WORD not in client.text
 
 
-def test_checkpoint_cannot_name_an_outside_robot(shared_viewer, folder, secret, monkeypatch):
+def test_checkpoint_cannot_name_an_outside_robot(files, folder, secret, monkeypatch):
     (folder / "runs").mkdir(exist_ok=True)
     (folder / "runs" / "some.pt").touch()
     for name in (f"{secret}/a.urdf", f"{secret}/a.grammar", f"{secret}"):
         run = SimpleNamespace(source=RobotSource(name, task="reach"))
-        monkeypatch.setattr(rollout, "read_checkpoint", lambda path, run=run: (run, None))
-        with PlainClient(shared_viewer.port, "?play=&policy=runs/some.pt") as client:
-            client.shows(NOTHING)
-            assert "outside of the folders" in client.text
-            assert WORD not in client.text
+        monkeypatch.setattr(simulation, "read_checkpoint", lambda path, run=run: (run, None))
+        with pytest.raises(MorphgenError, match="outside of the folders") as refused:
+            simulation.training_robots("runs/some.pt", files)
+        assert WORD not in str(refused.value)
 
 
 def test_episode_cannot_name_an_outside_robot(shared_viewer, folder, secret):

@@ -140,7 +140,7 @@ def test_the_time_of_a_paused_episode_is_in_the_address(see):
     press(page, "step")
     page.wait_for_url(re.compile(r"&t=1\.52$"))
     page.reload()
-    page.get_by_text("1.52 s; simulated: 1.52 s").wait_for()
+    page.get_by_text("1.52 s; simulated: 1.60 s").wait_for()
     press(page, "play")
     page.wait_for_url(re.compile(r"policy=jacobian$"))
     wait_for_end(page)

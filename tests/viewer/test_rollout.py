@@ -1,7 +1,10 @@
 """Rollouts equal those of ``morphgen play``; episodes are saved and loaded."""
 
 import json
+import pickle
+from concurrent.futures import Future
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,19 +19,21 @@ from morphgen.model.kinematics import frame_pose
 from morphgen.rl.baselines import baselines_for
 from morphgen.rl.inference import make_env_and_controller, play, read_controller
 from morphgen.rl.runs.training import train
+from morphgen.viewer import simulation
 from morphgen.viewer.app.address import Address, parse_address
 from morphgen.viewer.app.app import start_address
 from morphgen.viewer.episode import EpisodeError, episode_bytes, read_episode, score_until, snapshot
-from morphgen.viewer.pages.play import default_policy
+from morphgen.viewer.film import make_renderer
+from morphgen.viewer.pages.play import SIMULATOR_NAMES, default_policy
 from morphgen.viewer.robot_uri import FileAccess
-from morphgen.viewer.rollout import EpisodeSource, Rollout, RolloutConfig, simulators
+from morphgen.viewer.rollout import EpisodeSource, RemoteRollout, RolloutConfig
 from morphgen.viewer.scene.rollout import (
     GAP,
     episode_page,
     grid_positions,
-    make_renderer,
     track_area,
 )
+from morphgen.viewer.simulation import Rollout
 
 CUBE = "words:base=planar ee=cube"
 
@@ -77,6 +82,26 @@ def test_episode_equals_that_of_morphgen_play(episode):
     assert track.success[-1] == result.success
 
 
+def test_a_rollout_of_the_process_of_simulations_is_the_same(episode, files, module_cache):
+    def submit(work, *arguments):
+        future = Future()
+        future.set_result(pickle.loads(pickle.dumps(work(*arguments))))
+        return future
+
+    process = SimpleNamespace(submit=submit, result=Future.result)
+    config = RolloutConfig("reach", (CUBE, "robots/none", "robots/one"), "jacobian", 3)
+    remote = RemoteRollout(config, files, process)
+    assert (list(remote.faults), remote.max_steps) == (["robots/none"], 300)
+    assert remote.episode.num_steps == 0
+    while remote.advance():
+        pass
+    assert not remote.advance()
+    assert episode_bytes(remote.episode) == episode_bytes(episode)
+    assert len(simulation._rollouts) == 1
+    remote.close()
+    assert simulation._rollouts == {}
+
+
 def test_score_counts_the_steps_so_far(episode):
     track = episode.tracks[0]
     assert score_until(track, "reach", 0) is None
@@ -95,7 +120,7 @@ def test_episode_is_restored_from_its_file(episode, files, root, monkeypatch):
     for one, other in zip(read.tracks, episode.tracks, strict=True):
         assert one.uri == other.uri
         assert np.array_equal(one.q, other.q)
-        assert np.array_equal(one.marker_poses["goal"], other.marker_poses["goal"])
+        assert np.array_equal(one.poses["goal"], other.poses["goal"])
         assert one.score == pytest.approx(other.score, rel=1e-6)
         assert one.success == other.success
     assert episode_bytes(read) == content
@@ -211,7 +236,7 @@ def test_an_invalid_rollout_is_rejected(files, module_cache, config, why):
         Rollout(config, files)
 
 
-@pytest.mark.parametrize("simulator", simulators())
+@pytest.mark.parametrize("simulator", SIMULATOR_NAMES)
 def test_a_rollout_is_restored_from_its_address(shared_viewer, simulator):
     query = f"?play=push&robot={CUBE}&robot=robots/some-arm&policy=random&seed=7&obstacles=yes"
     query += "" if simulator == "mujoco" else f"&sim={simulator}"
@@ -285,6 +310,6 @@ def test_video_camera_frames_the_whole_episode(episode):
     points = make_renderer(track, (64, 48)).points
     low, high = points.min(axis=0), points.max(axis=0)
     tools = frame_pose(track.robot, np.array(track.q))[:, :3, 3]
-    for point in (track.marker_poses["goal"][0][:3], tools[-1]):
+    for point in (track.poses["goal"][0][:3], tools[-1]):
         assert (low - 0.01 < point).all()
         assert (point < high + 0.01).all()

@@ -21,9 +21,8 @@ from morphgen.grammar.request import parse_request
 from morphgen.model.kinematics import joint_limits
 from morphgen.tasks.render.renderer import Renderer, RenderState
 from morphgen.tasks.sim.base import Scene
+from morphgen.viewer import film
 from morphgen.viewer.app.web_page import joint_sweep, joint_titles, robot_page
-from morphgen.viewer.scene import robot as turntable_module
-from morphgen.viewer.scene.robot import turntable
 
 ADDRESS = re.compile(rb"""(?:src|href)=["'](?!data:)[^"']+["']""")
 
@@ -91,7 +90,7 @@ def test_the_ground_has_no_dark_dots_at_the_sides_of_a_picture():
     derivation = parse_request(["base=gantry", "ee=cube"], default_library())
     robot = compose(derivation, default_library(), "gantry")
     home = np.array([robot.home])
-    renderer = Renderer(Scene(robot), (), home, turntable_module._ring(robot), (480, 360))
+    renderer = Renderer(Scene(robot), (), home, film._ring(robot), (480, 360))
     frame = renderer.frame(RenderState(home[0]), 75).astype(int).sum(axis=2)
     renderer.close()
     darker = median_filter(frame, 5) - frame
@@ -100,10 +99,10 @@ def test_the_ground_has_no_dark_dots_at_the_sides_of_a_picture():
 
 
 def test_a_turntable_is_a_video_of_one_turn(monkeypatch, tmp_path):
-    monkeypatch.setattr(turntable_module, "SIZE", (64, 48))
-    monkeypatch.setattr(turntable_module, "NUM_FRAMES", 8)
+    monkeypatch.setattr(film, "SIZE", (64, 48))
+    monkeypatch.setattr(film, "NUM_FRAMES", 8)
     path = tmp_path / "turn.gif"
-    path.write_bytes(turntable(arm(), ".gif"))
+    path.write_bytes(film.turntable(arm(), ".gif"))
     frames = imageio.mimread(path)
     assert len(frames) == 8
     assert frames[0].shape[:2] == (48, 64)

@@ -7,11 +7,11 @@ import binascii
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from typing import Any
 from urllib.parse import parse_qsl, quote, urlencode
 
 from morphgen.errors import MorphgenError, nearest
+from morphgen.viewer.app.workers import load_function
 
 PAGES: Mapping[str, str] = {
     "library": "morphgen.viewer.pages.gallery:show_library",
@@ -29,10 +29,7 @@ PAGES: Mapping[str, str] = {
 
 def load_page(name: str) -> Callable[[Any], None]:
     """Import and return the function that builds a page for a ``Session``."""
-    module, _, function = PAGES[name].partition(":")
-    # Only now: ``play`` loads PyTorch and the simulators, which takes seconds and much memory.
-    show: Callable[[Any], None] = getattr(import_module(module), function)
-    return show
+    return load_function(PAGES[name])  # only now: pages import much that others do not need
 
 
 MAX_QUERY = 8000  # longest query [characters]

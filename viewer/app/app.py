@@ -26,7 +26,7 @@ from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.server import MessageFilter, access_policy, start_server, stop_server
 from morphgen.viewer.app.session import BUG, DEFAULT_WIDTH, Session
 from morphgen.viewer.app.viser_internals import clear_page
-from morphgen.viewer.app.workers import SharedResults, Workers
+from morphgen.viewer.app.workers import SharedResults, Workers, named
 from morphgen.viewer.robot_files import change_tray
 from morphgen.viewer.robot_uri import (
     CHECKPOINT,
@@ -51,6 +51,7 @@ class Viewer:
     start: Address  # page for browsers whose URL names none
     files: FileAccess
     workers: Workers
+    simulator: Workers  # one process, in which rollouts run
     uploads: TemporaryDirectory[str]  # deleted with the viewer, at the latest when its process ends
     sessions: dict[str, Session] = field(default_factory=dict)
     """Current sessions of the connected browsers, by the secret token that their scripts send."""
@@ -61,12 +62,17 @@ class Viewer:
         """Port on which the viewer listens."""
         return self.server.get_port()
 
+    def warm_up(self) -> None:
+        """Load what the first rollout needs, in its process, while nobody waits for it."""
+        self.simulator.submit(named("morphgen.viewer.simulation:warm_up"), self.files)
+
     def stop(self) -> None:
         """End all sessions, the server and its workers, and delete the uploads."""
         for session in list(self.sessions.values()):
             session.disconnect()
         stop_server(self.server)
         self.workers.close()
+        self.simulator.close()
         self.uploads.cleanup()
 
 
@@ -94,7 +100,7 @@ def serve(
         return viewer is not None and _receive(viewer, token, query)
 
     server = start_server(host, port, policy, receive)
-    viewer = Viewer(server, start, files, Workers(NUM_WORKERS), uploads)
+    viewer = Viewer(server, start, files, Workers(NUM_WORKERS), Workers(1), uploads)
     _accept_browsers(viewer)
     return viewer
 
@@ -104,7 +110,14 @@ def _accept_browsers(viewer: Viewer) -> None:
 
     async def connect(client: viser.ClientHandle) -> None:
         token = secrets.token_urlsafe(24)
-        session = Session(client, viewer.files, viewer.workers, viewer.start, cache=viewer.cache)
+        session = Session(
+            client,
+            viewer.files,
+            viewer.workers,
+            viewer.simulator,
+            viewer.start,
+            cache=viewer.cache,
+        )
         viewer.sessions[token] = session
 
         def report(reason: str) -> None:

@@ -47,6 +47,7 @@ class Session:
     browser: viser.ClientHandle
     files: FileAccess
     workers: Workers  # processes for slow work, shared by all browsers
+    simulator: Workers  # the process of all rollouts
     address: Address  # address of the page with its state, as the URL shows it
     dark: bool = False  # whether the page is dark
     width: int = DEFAULT_WIDTH  # width of the browser's window when the page was opened [pixels]

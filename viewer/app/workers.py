@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from ctypes import c_byte
+from importlib import import_module
 from multiprocessing import get_context
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from morphgen.errors import MorphgenError
 from morphgen.processes import call_in_worker, init_worker, sigint_blocked
@@ -60,6 +62,22 @@ class Workers:
 
     def _new_pool(self) -> ProcessPoolExecutor:
         return ProcessPoolExecutor(self._n, self._context, init_worker, (self._stopped,))
+
+
+def named(path: str) -> Callable[..., Any]:
+    """Return a function ``module:name`` for a worker, without importing its module here."""
+    return functools.partial(_call_named, path)
+
+
+def _call_named(path: str, *arguments: object) -> object:
+    return load_function(path)(*arguments)
+
+
+def load_function(path: str) -> Callable[..., Any]:
+    """Import and return a function ``module:name``."""
+    module, _, name = path.partition(":")
+    function: Callable[..., Any] = getattr(import_module(module), name)
+    return function
 
 
 MAX_RESULTS = 24  # results that are kept; a population of 1,000 robots takes tens of megabytes

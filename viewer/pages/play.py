@@ -16,11 +16,12 @@ from viser import uplot
 from morphgen.errors import MorphgenError, TaskError, nearest
 from morphgen.rl.baselines import baselines_for
 from morphgen.rl.shipped_policies import is_named, policies_for, zero_shot_policy
-from morphgen.tasks.registry import TASKS
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.typing import Array
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import MAX_PLAYED, Address, AddressError
 from morphgen.viewer.app.session import Session, set_value
+from morphgen.viewer.app.workers import named
 from morphgen.viewer.controls import Robots, add_picker, bind, picked_uri, robot_lists
 from morphgen.viewer.episode import Episode, episode_bytes, read_episode, score_until, snapshot
 from morphgen.viewer.robot_uri import DEFAULT_WORDS, EPISODE_SUFFIX, WORDS, FileAccess, uri_name
@@ -28,21 +29,21 @@ from morphgen.viewer.rollout import (
     SPEEDS,
     EpisodeSource,
     Player,
-    Rollout,
+    RemoteRollout,
     RolloutConfig,
     list_checkpoints,
-    simulators,
-    training_robots,
+    simulation,
 )
 from morphgen.viewer.scene.rollout import (
     RolloutScene,
     add_episode,
     episode_page,
-    render_video,
     show_step,
 )
 from morphgen.viewer.scene.stage import look_at
 
+SIMULATOR_NAMES = (DEFAULT_SIMULATOR, *sorted({*SIMULATORS} - {DEFAULT_SIMULATOR, "warp"}))
+"""Simulators for a single environment; Warp needs a GPU."""
 PANEL_WIDTH = 400.0  # width of the panel [pixels]
 PLANNERS = ("ik", "scripted")  # policies whose first step takes seconds, because they plan a path
 ACTIONS = ("replace", "add", "only")  # replace the first robot, add one, or remove all others
@@ -143,7 +144,7 @@ class PlayPage:
             policy = gui.add_dropdown("policy", policies, initial_value=asked)
             obstacles = gui.add_checkbox("obstacles", initial_value=False)
             seed = gui.add_number("seed", 0, min=0, step=1)
-            simulator = gui.add_dropdown("simulator", tuple(simulators()))
+            simulator = gui.add_dropdown("simulator", SIMULATOR_NAMES)
         with gui.add_folder("Robots"):
             lists = {"trained on": lambda: trained_on} if trained_on else {}
             picker = add_picker(
@@ -161,7 +162,8 @@ class PlayPage:
             )
             session.address = replace(session.address, subjects=(task.value,), robots=robots)
             session.title = f"{task.value} {uri_name(robots[0])}"
-            self.load(lambda: Rollout(config, session.files, session.set_status))
+            session.set_status(f"preparing {', '.join(map(uri_name, robots))}")
+            self.load(lambda: RemoteRollout(config, session.files, session.simulator))
 
         def start_next() -> None:
             set_value(seed, seed.value + 1)
@@ -208,7 +210,7 @@ class PlayPage:
             with session.activity(f"making the {suffix} of {seconds:.2f} s"):
                 session.send_file(name, make(episode))
 
-        film = functools.partial(session.run_in_worker, render_video)
+        film = functools.partial(session.run_in_worker, named("morphgen.viewer.film:render_video"))
         downloads: tuple[tuple[str, str, Callable[[Episode], bytes]], ...] = (
             (f"Save episode ({EPISODE_SUFFIX})", EPISODE_SUFFIX, episode_bytes),
             ("Film (.mp4)", ".mp4", film),
@@ -242,7 +244,7 @@ class PlayPage:
             self._charts = add_charts(client.gui, episode, dark=self.session.dark)
         self._time.max = max(source.max_steps, 1) * episode.period
         self._show_faults(source.faults.values())
-        self._is_planning = isinstance(source, Rollout) and episode.policy in PLANNERS
+        self._is_planning = isinstance(source, RemoteRollout) and episode.policy in PLANNERS
         self.session.set_status("the policy plans its path" if self._is_planning else "")
 
     def show_step(self, step: int) -> None:
@@ -324,11 +326,12 @@ def complete_address(session: Session) -> Robots:
     policy = session.address.state.get("policy", "")
     if not policy or is_named(policy):
         return []
-    task, obstacles, robots = training_robots(policy, session.files)
+    call = session.simulator.submit(simulation("training_robots"), policy, session.files)
+    task, obstacles, trained_on = session.simulator.result(call)
     if not session.address.subject:
         address = replace(session.address, subjects=(task,))
         session.address = address.with_state(obstacles="yes" if obstacles else "")
-    return robots
+    return [*trained_on]
 
 
 def _policies(files: FileAccess, task: str, policy: str) -> tuple[str, ...]:

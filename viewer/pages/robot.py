@@ -41,6 +41,7 @@ from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.app.viser_internals import control_id
 from morphgen.viewer.app.web_page import robot_page
+from morphgen.viewer.app.workers import named
 from morphgen.viewer.controls import bind
 from morphgen.viewer.robot_files import bundle_files, zip_files
 from morphgen.viewer.robot_rows import neighbour_uris
@@ -646,6 +647,7 @@ def _add_downloads(page: RobotPage) -> None:
     """Add buttons for the bundle, its files, pictures and films, and the robot's command."""
     gui, session, robot = page.session.client.gui, page.session, page.robot
     run, name = session.run_in_worker, page.robot.name or "robot"
+    turntable = named("morphgen.viewer.film:turntable")
     hint = "adds robot.html, which shows the robot in 3D without a server or a network"
     with_page = gui.add_checkbox("bundle with a web page", initial_value=False, hint=hint)
 
@@ -669,8 +671,8 @@ def _add_downloads(page: RobotPage) -> None:
         "MJCF": (".xml", lambda: bundle()[MJCF]),
         "Screenshot": (".png", lambda: _screenshot(session.client)),
         "Web page (.html)": (".html", web_page),
-        "Turntable (.mp4)": (".mp4", lambda: run(scene_robot.turntable, robot, ".mp4")),
-        "Turntable (.gif)": (".gif", lambda: run(scene_robot.turntable, robot, ".gif")),
+        "Turntable (.mp4)": (".mp4", lambda: run(turntable, robot, ".mp4")),
+        "Turntable (.gif)": (".gif", lambda: run(turntable, robot, ".gif")),
     }
     for label, (suffix, make) in downloads.items():
         button = gui.add_button(label, icon=viser.Icon.DOWNLOAD)

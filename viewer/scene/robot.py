@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
@@ -16,8 +14,6 @@ from morphgen.model.geometry import Box, Pose, Shape
 from morphgen.model.inertia import bounding_box, box_corners
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Robot
-from morphgen.tasks.render.renderer import Frame, Renderer, RenderState, write_video
-from morphgen.tasks.sim.base import Scene
 from morphgen.typing import Array
 from morphgen.viewer.scene.stage import (
     MIN_EXTENT,
@@ -221,37 +217,3 @@ def _add_mesh(
         cast_shadow=opacity is None,
     )
     return DrawnShape(handle, colour)
-
-
-SIZE = (640, 480)  # width and height of a frame [pixels]
-NUM_FRAMES, FPS = 72, 18  # frames of a turn, and frames per second: a turn takes four seconds
-_RING_POINTS = 24
-
-
-def turntable(robot: Robot, suffix: str) -> bytes:
-    """Return a video of a robot at home that turns once around the vertical."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"turntable{suffix}"
-        write_video(_frames(robot), path, FPS)
-        return path.read_bytes()
-
-
-def _frames(robot: Robot) -> Iterator[Frame]:
-    """Yield the frames of a turn; the camera sees the robot from every side."""
-    home = np.array([robot.home], dtype=np.float64)
-    renderer = Renderer(Scene(robot), (), home, _ring(robot), SIZE)
-    try:
-        state = RenderState(home[0].astype(np.float32))
-        for i in range(NUM_FRAMES):
-            yield renderer.frame(state, 360 * i / NUM_FRAMES)
-    finally:
-        renderer.close()
-
-
-def _ring(robot: Robot) -> Array:
-    """Return points on the cylinder that a robot's bounding box fills as it turns, (n, 3) [m]."""
-    low, high = robot_bounds(robot)
-    middle, radius = (low + high) / 2, float(np.linalg.norm((high - low)[:2])) / 2
-    angles = np.linspace(0, 2 * np.pi, _RING_POINTS, endpoint=False)
-    circle = middle[:2] + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    return np.concatenate([np.insert(circle, 2, z, axis=1) for z in (max(low[2], 0.0), high[2])])

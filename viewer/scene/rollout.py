@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import viser
 from viser.infra import StateSerializer
 
 from morphgen.model.geometry import Pose
-from morphgen.tasks.render.renderer import SIZE, Frame, Renderer, RenderState, write_video
-from morphgen.tasks.sim.base import Block, Scene
+from morphgen.tasks.sim.base import Block
 from morphgen.tasks.task import Marker
 from morphgen.typing import Array
 from morphgen.viewer.app.web_page import scene_server, web_page
-from morphgen.viewer.episode import Episode, Track
+from morphgen.viewer.episode import BLOCK, STRIDE, Episode, Track
 from morphgen.viewer.scene.robot import RobotView, add_robot, robot_bounds
 from morphgen.viewer.scene.stage import Rgb, add_ground, place_camera, set_stage
 
@@ -38,8 +34,7 @@ class DrawnTrack:
 
     track: Track
     view: RobotView
-    block: viser.BoxHandle | None
-    markers: dict[str, viser.FrameHandle | viser.BoxHandle]
+    moving: dict[str, viser.FrameHandle | viser.BoxHandle]  # markers and the block, by name
 
 
 @dataclass(eq=False)
@@ -77,11 +72,8 @@ def show_step(scene: RolloutScene, step: int) -> None:
         track = drawn.track
         i = min(step, track.num_steps)
         drawn.view.set_configuration(track.q[i])
-        moving = [(handle, track.marker_poses[name]) for name, handle in drawn.markers.items()]
-        if drawn.block is not None:
-            moving.append((drawn.block, track.block))
-        for handle, poses in moving:
-            pose = poses[i].tolist()
+        for name, handle in drawn.moving.items():
+            pose = track.poses[name][i].tolist()
             handle.position, handle.wxyz = tuple(pose[:3]), tuple(pose[3:])
 
 
@@ -90,8 +82,7 @@ def track_area(track: Track) -> tuple[Array, Array]:
     points = [np.zeros(3)]
     for q in (track.robot.home, track.q[0]):
         points += robot_bounds(track.robot, q)
-    moving = [*([track.block] if track.block else []), *track.marker_poses.values()]
-    points += [poses[0][:3].astype(np.float64) for poses in moving]
+    points += [poses[0][:3].astype(np.float64) for poses in track.poses.values()]
     points += [np.array(block.pose.position) for block in track.obstacles]
     return np.min(points, axis=0), np.max(points, axis=0)
 
@@ -114,14 +105,13 @@ def _add_track(
     view = add_robot(scene, track.robot, f"{name}/robot")
     for i, obstacle in enumerate(track.obstacles):
         _add_box(scene, f"{name}/obstacle{i}", obstacle, _OBSTACLE)
-    markers = {m.name: _add_marker(scene, f"{name}/{m.name}", m) for m in track.markers}
-    block = None
-    if track.block and track.block_size is not None:
-        block = _add_box(scene, f"{name}/block", Block(track.block_size, Pose()), _BLOCK)
+    moving = {m.name: _add_marker(scene, f"{name}/{m.name}", m) for m in track.markers}
+    if track.block_size is not None:
+        moving[BLOCK] = _add_box(scene, f"{name}/block", Block(track.block_size, Pose()), _BLOCK)
     if labelled:
         foot = (0.0, 0.0, track.ground or 0.0)  # a robot moves away from a name above it
         scene.add_label(f"{name}/label", track.robot.name, position=foot, anchor="top-center")
-    return DrawnTrack(track, view, block, markers)
+    return DrawnTrack(track, view, moving)
 
 
 def _add_marker(
@@ -144,18 +134,6 @@ def _add_box(scene: viser.SceneApi, name: str, block: Block, colour: Rgb) -> vis
     )
 
 
-STRIDE = 2  # control steps between two frames
-_FRAMED_STEPS = 32  # steps, evenly spread over the episode, by which the camera is framed
-
-
-def render_video(episode: Episode) -> bytes:
-    """Return an ``.mp4`` of an episode in real time; several robots are tiled."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "episode.mp4"
-        write_video(_render_frames(episode), path, 1 / (STRIDE * episode.period))
-        return path.read_bytes()
-
-
 def episode_page(episode: Episode, dark: bool) -> bytes:
     """Return a web page that plays an episode without a server or a network."""
     with scene_server() as server:
@@ -164,55 +142,12 @@ def episode_page(episode: Episode, dark: bool) -> bytes:
         return web_page(recording, f"{episode.task}: {episode.tracks[0].robot.name}", dark=dark)
 
 
-def make_renderer(track: Track, size: tuple[int, int]) -> Renderer:
-    """Return a renderer whose camera sees a robot's whole episode."""
-    steps = np.linspace(0, track.num_steps, min(_FRAMED_STEPS, track.num_steps + 1)).astype(int)
-    configurations = np.array([track.robot.home, *(track.q[i] for i in steps)], dtype=np.float64)
-    block = None if track.block_size is None else Block(track.block_size)
-    scene = Scene(track.robot, block=block, obstacles=track.obstacles, ground=track.ground)
-    moving = [*([track.block] if track.block else []), *track.marker_poses.values()]
-    positions = [poses[i][:3] for poses in moving for i in steps]
-    points = np.array(positions, dtype=np.float64).reshape(-1, 3)
-    margin = 0.0 if track.block_size is None else max(track.block_size) / 2
-    points = np.concatenate([points - margin, points + margin])
-    return Renderer(scene, track.markers, configurations, points, size)
-
-
 def _record(server: viser.ViserServer, episode: Episode) -> StateSerializer:
     """Draw an episode in a server's scene and return its recording."""
     scene = add_episode(server.scene, episode)
     place_camera(server.initial_camera, scene.low, scene.high)
     recording = server.get_scene_serializer()
-    for step in _frame_steps(episode):
+    for step in episode.film_steps:
         show_step(scene, step)
         recording.insert_sleep(STRIDE * episode.period)
     return recording
-
-
-def _render_frames(episode: Episode) -> Iterator[Frame]:
-    """Yield the frames of a video: the robots of a step, tiled."""
-    columns = int(np.ceil(np.sqrt(len(episode.tracks))))
-    width, height = (2 * round(edge / columns / 2) for edge in SIZE)  # video codecs want even sizes
-    with contextlib.ExitStack() as stack:
-        renderers = []
-        for track in episode.tracks:
-            renderers.append(make_renderer(track, (width, height)))
-            stack.callback(renderers[-1].close)
-        for step in _frame_steps(episode):
-            tiles = [
-                renderer.frame(_render_state(track, min(step, track.num_steps)))
-                for renderer, track in zip(renderers, episode.tracks, strict=True)
-            ]
-            tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
-            rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
-            yield np.vstack(rows)
-
-
-def _render_state(track: Track, i: int) -> RenderState:
-    markers = {name: poses[i] for name, poses in track.marker_poses.items()}
-    return RenderState(track.q[i], track.block[i] if track.block else None, markers)
-
-
-def _frame_steps(episode: Episode) -> list[int]:
-    """Return the steps that are shown: the start, every ``STRIDE`` steps, and the end."""
-    return [*range(0, episode.num_steps, STRIDE), episode.num_steps]
