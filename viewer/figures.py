@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from html import escape
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
 
 from morphgen.typing import Array
 from morphgen.viewer.app.address import Address
@@ -19,7 +20,8 @@ _NUM_BARS, _HISTOGRAM_HEIGHT = 40, 60  # bars of a histogram, and its height in 
 _WIDTH = 480  # width of an SVG in its own units
 _MAP_WIDTH, _MAP_CELL, _MAP_LABEL = 900.0, (100.0, 95.0), 18
 """Width of a map, width and height of a robot with its name, and letters of a name that fit."""
-_MAX_ROUNDS = 200  # rounds in which the robots of a map move apart
+_MIN_COLUMNS, _MAP_ASPECT = 9, 2.5
+"""Columns of a map of few robots, and columns by rows."""
 _BLUES = ((247, 251, 255), (107, 174, 214), (8, 48, 107))  # white to dark blue
 
 
@@ -40,18 +42,14 @@ def map_svg(
 ) -> str:
     """Return a map of robots at points (n, 2); a click on a picture opens the robot.
 
-    Robots move apart where they would cover each other. Their frame and name show their side.
+    No robot covers another. Their frame and name show their side.
     """
-    low, high = points.min(axis=0), points.max(axis=0)
-    span = np.maximum(high - low, 1e-9)
-    columns = max(_MAP_WIDTH / _MAP_CELL[0] - 1, math.sqrt(2.5 * len(points)))
-    scale = columns / max(float(span[0]), float(span[1]) / 2)  # at most half as many rows
-    cells = spread((points - low) * scale * np.array([1.0, -1.0]))
-    cells -= cells.min(axis=0)
+    cells = map_cells(points)
+    columns, rows = (cells.max(axis=0) + 1).tolist()
     # Many robots make the pictures smaller, never the map larger.
-    unit = _MAP_WIDTH / (float(cells[:, 0].max()) + 1)
-    width, height = unit, unit * _MAP_CELL[1] / _MAP_CELL[0]
-    inner, label = 0.94 * width, min(13.0, 0.13 * unit)
+    width = _MAP_WIDTH / max(columns, _MIN_COLUMNS)
+    height = width * _MAP_CELL[1] / _MAP_CELL[0]
+    inner, label = 0.94 * width, min(13.0, 0.13 * width)
     marks = []
     for (x, y), name, side, uri in zip(cells.tolist(), names, sides, uris, strict=True):
         query, colour = escape(Address("robot", (uri,)).query), SIDE_COLOURS[side]
@@ -66,29 +64,22 @@ def map_svg(
             f'y="{y * height + 0.75 * inner + 1.1 * label:.1f}" fill="{colour}">'
             f"{escape(name[:_MAP_LABEL])}</text></g></a>"
         )
-    rows = float(cells[:, 1].max()) + 1
     return _svg(rows * height + label, "".join(marks), _MAP_WIDTH)
 
 
-def spread(points: Array) -> Array:
-    """Move points (n, 2) apart until neighbours have about the distance 1; far ones stay."""
-    # A seeded offset, because points at the same place have no direction to part.
-    rng = np.random.default_rng(0)
-    points = points + rng.uniform(-0.05, 0.05, points.shape)
-    for _ in range(_MAX_ROUNDS):
-        pairs = cKDTree(points).query_pairs(0.98, output_type="ndarray")
-        if not len(pairs):
-            break
-        i, j = pairs.T
-        offset = points[i] - points[j]
-        length = np.linalg.norm(offset, axis=1, keepdims=True)
-        step = 0.5 * (1 - length) * offset / np.maximum(length, 1e-12)
-        shift, count = np.zeros_like(points), np.bincount(pairs.ravel(), minlength=len(points))
-        np.add.at(shift, i, step)
-        np.add.at(shift, j, -step)
-        # The square root keeps crowds from exploding, and is faster than the mean.
-        points = points + shift / np.sqrt(np.maximum(count, 1))[:, None]
-    return np.asarray(points)
+def map_cells(points: Array) -> NDArray[np.intp]:
+    """Return a cell (column, row) for each point (n, 2), each another one and near its point.
+
+    The points fill the map; a fifth of its cells or more stay free.
+    """
+    n = len(points)
+    columns = max(_MIN_COLUMNS, round(math.sqrt(_MAP_ASPECT * n)))
+    rows = max(math.ceil(1.25 * n / columns), round(columns / _MAP_ASPECT))
+    span = np.maximum(np.ptp(points, axis=0), 1e-9)
+    wanted = (points - points.min(axis=0)) / span * (columns - 1, 1 - rows) + (0, rows - 1)
+    cells = np.stack(np.divmod(np.arange(rows * columns), columns)[::-1], axis=1)
+    _, chosen = linear_sum_assignment(cdist(wanted, cells, "sqeuclidean"))
+    return np.asarray(cells[chosen])
 
 
 def heatmap_svg(values: Array, names: Sequence[str], sides: Sequence[str], *, larger: bool) -> str:

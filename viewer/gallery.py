@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import dataclass, field, replace
@@ -18,15 +17,8 @@ from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.session import Session
 from morphgen.viewer.app.workers import WorkerDied
 from morphgen.viewer.controls import bind
-from morphgen.viewer.robot_files import (
-    Thumbnail,
-    make_thumbnail,
-    measure_picture,
-    thumbnail_of_picture,
-)
+from morphgen.viewer.robot_files import Thumbnail, make_thumbnail, thumbnail_of_picture
 from morphgen.viewer.robot_rows import FILTERS, UNITS, WORDS_OF_ROWS, Row, passes
-
-SCALES = ("common", "own")  # of pictures: one for all, or each robot fills its own
 
 
 @dataclass(eq=False)
@@ -37,7 +29,6 @@ class Gallery:
     title: str
     rows: list[robot_rows.Row]  # all robots, shown or not
     columns: tuple[str, ...] = ()  # roles in a column each; without any, there is one grid
-    scale: str = SCALES[1]  # scale of pictures at first, one of `SCALES`
     noun: str = "robot"  # what a row shows: a robot, or a part of the library
     thumbnails: dict[str, str] = field(default_factory=dict)  # thumbnails drawn so far, by URI
     faults: dict[str, str] = field(default_factory=dict)  # errors of unreadable robots, by URI
@@ -53,10 +44,9 @@ class Gallery:
     page_number: int = 1
 
 
-def card(row: robot_rows.Row, thumbnail: str, fault: str, share: float = 1.0) -> str:
+def card(row: robot_rows.Row, thumbnail: str, fault: str) -> str:
     """Return a robot's card in the grid: a link to its page, and a check box that chooses it."""
-    shrunk = f' style="transform:scale({share:.3f})"' if share < 1 else ""
-    image = f'<div class="picture"><img alt="" src="{thumbnail}"{shrunk}></div>'
+    image = f'<div class="picture"><img alt="" src="{thumbnail}"></div>'
     if not thumbnail:
         image = f'<div class="empty">{"broken" if fault else "…"}</div>'
     tags = markup.tag(row.role, row.role) if row.role else ""
@@ -76,33 +66,21 @@ def card(row: robot_rows.Row, thumbnail: str, fault: str, share: float = 1.0) ->
     )
 
 
-def shares(gallery: Gallery, rows: Iterable[robot_rows.Row]) -> tuple[list[float], float]:
-    """Return the size of each picture, and the height that a whole card shows [m]."""
-    heights = [row.picture_height or math.nan for row in rows]
-    known = [row.picture_height for row in gallery.rows if row.picture_height]
-    if gallery.controls["scale"].value == "own" or not known:
-        return [1.0] * len(heights), math.nan
-    tallest = max(known)
-    return [1.0 if math.isnan(height) else height / tallest for height in heights], tallest
-
-
 def draw_cards(gallery: Gallery) -> None:
     """Draw the cards of the current page, in a column for each role if there are columns."""
     if gallery.grid is None:
         return
     columns: dict[str, list[str]] = {role: [] for role in gallery.columns}
-    sizes, height = shares(gallery, gallery.page_rows)
-    for row, share in zip(gallery.page_rows, sizes, strict=True):
+    for row in gallery.page_rows:
         thumbnail, fault = gallery.thumbnails.get(row.uri, ""), gallery.faults.get(row.uri, "")
         role = row.role if gallery.columns else ""
-        columns.setdefault(role, []).append(card(row, thumbnail, fault, share))
+        columns.setdefault(role, []).append(card(row, thumbnail, fault))
     html = [
         f"<div>{f'<h3>{role} ({len(cards)})</h3>' if role else ''}"
         f'<div class="grid">{"".join(cards)}</div></div>'
         for role, cards in columns.items()
     ]
-    scale = "" if math.isnan(height) else f" · a card is {height:.2g} m high"
-    summary = f'<div class="dim" style="padding:.6em 0">{gallery.summary}{scale}</div>'
+    summary = f'<div class="dim" style="padding:.6em 0">{gallery.summary}</div>'
     content = f'<div class="columns">{"".join(html)}</div>' if gallery.page_rows else gallery.empty
     notices = [
         f"<div>{markup.tag('address', 'warning')} {escape(notice)}</div>"
@@ -127,7 +105,6 @@ def add_filter(gallery: Gallery) -> None:
     session, gui = gallery.session, gallery.session.client.gui
     gallery.controls["search"] = gui.add_text("Search", "")
     bind(session, "search", gallery.controls["search"])
-    _add_dropdown(gallery, "scale", "Scale", sorted(SCALES, key=lambda name: name != gallery.scale))
     _add_dropdown(gallery, "sort", "Sort by", _SORTS)
     is_filtered = not session.address.state.keys().isdisjoint({*FILTERS[1:], "size"})
     with gui.add_folder("Filter", expand_by_default=is_filtered):
@@ -277,7 +254,7 @@ def load_bundle_pictures(gallery: Gallery, rows: Iterable[Row]) -> None:
 def load_pictures(
     gallery: Gallery, rows: Sequence[Row], is_wanted: Callable[[], bool] = lambda: True
 ) -> None:
-    """Load or draw the pictures that rows lack while they are wanted, and measure their scale.
+    """Load or draw the pictures that rows lack while they are wanted.
 
     If a worker dies, they are requested once more.
     """
@@ -294,12 +271,8 @@ def _request_missing(gallery: Gallery, rows: Sequence[Row], is_wanted: Callable[
     session, workers = gallery.session, gallery.session.workers
     pending = {}
     for row in rows:
-        if row.uri in gallery.faults:
-            continue
-        if row.uri not in gallery.thumbnails:
+        if row.uri not in gallery.faults and row.uri not in gallery.thumbnails:
             pending[row.uri] = workers.submit(make_thumbnail, row.uri, session.files)
-        elif row.picture_height is None and gallery.controls["scale"].value == "common":
-            pending[row.uri] = workers.submit(measure_picture, row.uri, session.files)
     total = len(pending)
     while pending and not session.closed.is_set() and is_wanted():
         session.set_status(f"drawing {total} robots", (total - len(pending)) / total)

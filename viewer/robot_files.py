@@ -18,11 +18,10 @@ from platformdirs import user_cache_path
 from morphgen.benchmark.survey import robot_stats
 from morphgen.checks import check
 from morphgen.errors import MorphgenError
-from morphgen.formats.bundle import CARD, MJCF, PICTURE, write_bundle
-from morphgen.formats.files import write_atomic, write_cache_file
-from morphgen.formats.picture import framed_height, render
+from morphgen.formats.bundle import CARD, MJCF, write_bundle
+from morphgen.formats.files import write_cache_file
+from morphgen.formats.picture import render
 from morphgen.formats.zip_files import write_entries
-from morphgen.grammar.robot_source import is_robot_folder
 from morphgen.model.robot import Robot
 from morphgen.model.scene_files import read_picture
 from morphgen.viewer.app.address import AddressError
@@ -32,7 +31,7 @@ from morphgen.viewer.robot_uri import FileAccess, UriError, content_hash, read_r
 
 SIZE = (240, 180)  # largest width and height of a thumbnail [pixels]
 _JPEG_QUALITY = 82  # JPEG quality of thumbnails, 0 to 100; tuned by eye at the size of a card
-_CACHE_FORMAT = 2  # increase it when a thumbnail or its facts change for the same robot
+_CACHE_FORMAT = 3  # increase it when a thumbnail or its facts change for the same robot
 
 
 @dataclass(frozen=True)
@@ -59,14 +58,6 @@ def make_thumbnail(uri: str, files: FileAccess) -> Thumbnail:
     with suppress(OSError):  # without a writable cache it is drawn again next time
         write_cache_file(path, json.dumps({"thumbnail": thumbnail.image, "facts": thumbnail.facts}))
     return thumbnail
-
-
-def measure_picture(uri: str, files: FileAccess) -> Thumbnail:
-    """Return a thumbnail without its image, with the height that it shows. Runs in a worker."""
-    try:
-        return Thumbnail("", {"picture_height": framed_height(read_robot_uri(uri, files))})
-    except MorphgenError as error:
-        return Thumbnail("", {}, files.redact(error))
 
 
 def thumbnail_of_picture(path: Path) -> str:
@@ -107,7 +98,7 @@ def _read_files(folder: Path) -> dict[str, bytes]:
 
 
 def _draw_thumbnail(uri: str, files: FileAccess) -> Thumbnail:
-    """Read, check and render a robot; store the picture in a bundle that has none."""
+    """Read, check and render a robot."""
     robot = read_robot_uri(uri, files)
     findings = {finding.code for finding in check(robot) if finding.severity != "info"}
     stats = robot_stats(robot)
@@ -117,24 +108,11 @@ def _draw_thumbnail(uri: str, files: FileAccess) -> Thumbnail:
         "reach": stats.reach if has_tool(robot) and stats.dof else None,
         "mass": stats.mass,
         "findings": tuple(sorted(findings)),
-        "picture_height": framed_height(robot),
     }
     with tempfile.TemporaryDirectory() as folder:
         bundle = write_bundle(robot, Path(folder) / "robot", picture=False)
         picture = render(robot, bundle / MJCF, size=(2 * SIZE[0], 2 * SIZE[1]))
-    if ":" not in uri and is_robot_folder(files.path(uri)):
-        _store_picture(files.path(uri) / PICTURE, picture)
     return Thumbnail(_data_url(picture), facts)
-
-
-def _store_picture(path: Path, picture: Image.Image) -> None:
-    """Store the picture in a bundle that has none, if the folder is writable."""
-    if path.exists():
-        return
-    content = io.BytesIO()
-    picture.save(content, "PNG")
-    with suppress(OSError):  # in a folder of somebody else; the user's cache has the thumbnail
-        write_atomic(path, content.getvalue())
 
 
 def _data_url(picture: Image.Image) -> str:

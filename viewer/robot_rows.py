@@ -59,7 +59,6 @@ class Row:
     mass: float | None = None  # mass [kg]
     findings: tuple[str, ...] | None = None  # errors and warnings; sets have all
     order: int = 0
-    picture_height: float | None = None  # shown at the robot's middle [m]
 
 
 FILTERS = ("search", "category", "role", "licence", "findings", *NUMBERS)

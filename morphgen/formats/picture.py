@@ -84,12 +84,6 @@ def render(
     return Image.fromarray(pixels[::-1])  # OpenGL's rows begin at the bottom
 
 
-def framed_height(robot: Robot) -> float:
-    """Return the height at the middle of a robot that its picture at home shows [m]."""
-    _, distance = _framing(robot, np.asarray(robot.home), SIZE[0] / SIZE[1])
-    return 2 * distance * math.tan(math.radians(_FOV / 2))
-
-
 def _framing(robot: Robot, q: Array, aspect: float) -> tuple[Array, float]:
     """Return the closest view that shows the whole robot and its root's origin, centred.
 

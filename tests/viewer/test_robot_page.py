@@ -61,9 +61,9 @@ def test_colliding_links_are_red(see, viewer):
 
 
 @pytest.mark.slow
-def test_workspace_trail_and_gizmo(see, viewer, picture):
+def test_workspace_and_gizmo(see, viewer, picture):
     on = viewer()
-    page = see(f"{ARM}&show=visual,workspace,trail,drag the tool", on=on)
+    page = see(f"{ARM}&show=visual,workspace,drag the tool", on=on)
     wait_for_page(page)
     field(page, "shoulder").last.fill("-0.5")
     page.wait_for_url(re.compile(r"q=-0\.5"))
@@ -71,7 +71,7 @@ def test_workspace_trail_and_gizmo(see, viewer, picture):
     page.wait_for_url(re.compile(r"q=0\.5"))
     names = nodes(on)
     page.wait_for_timeout(1000)
-    assert {"/robot/workspace", "/robot/trail", "/gizmo"} <= names.keys()
+    assert {"/robot/workspace", "/gizmo"} <= names.keys()
     robot = read_robot_uri("robots/some-arm", on.files)
     pose = frame_pose(robot, [0.5, *robot.home[1:]])
     assert names["/gizmo"].position == pytest.approx(pose[:3, 3], abs=1e-6)

@@ -242,10 +242,19 @@ class MessageFilter:
     def start_upload(self, client_id: Any, message: UploadStart) -> None:  # noqa: ANN401
         """Start an upload; an unfinished one is dropped, so a browser holds at most one."""
         self._drop_upload()
-        if reason := _upload_fault(message):
+        reason, size, limit = "", message.size_bytes, MAX_UPLOAD // 2**20
+        if size > MAX_UPLOAD:
+            reason = (
+                f"{size / 2**20:.0f} MB; at most {limit} MB are accepted: open it on this machine "
+                "instead, with morphgen view"
+            )
+        # viser waits for all parts in memory: more parts than bytes would never end.
+        elif not 0 <= message.part_count <= size:
+            reason = f"{size} bytes in {message.part_count} parts"
+        if reason:
             self._report(f"{message.filename[:MAX_NAME]}: {reason}")
             return
-        self._upload, self._rest = message.transfer_uuid, message.size_bytes
+        self._upload, self._rest = message.transfer_uuid, size
         self._viser[UploadStart](client_id, message)
 
     def receive_part(self, client_id: Any, message: UploadPart) -> None:  # noqa: ANN401
@@ -262,19 +271,6 @@ class MessageFilter:
     def _drop_upload(self) -> None:
         discard_upload(self._client, self._upload)
         self._upload = ""
-
-
-def _upload_fault(message: UploadStart) -> str:
-    """Return why an upload is rejected; empty if it is accepted."""
-    if message.size_bytes > MAX_UPLOAD:
-        return (
-            f"{message.size_bytes / 2**20:.0f} MB; at most {MAX_UPLOAD // 2**20} MB are accepted: "
-            "open it on this machine instead, with morphgen view"
-        )
-    # viser waits for all parts in memory: more parts than bytes would never end.
-    if not 0 <= message.part_count <= message.size_bytes:
-        return f"{message.size_bytes} bytes in {message.part_count} parts"
-    return ""
 
 
 def _valid_value(handle: Any, value: object) -> object:  # noqa: ANN401

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -315,11 +314,10 @@ class Session:
             if self.closed.is_set() or (key and key in self.pending):
                 return
             self.pending.add(key)
-            future = threads.submit(self._run, work, key, even_closed=even_closed)
-        future.add_done_callback(self._print_bug)
+            threads.submit(self._run, work, key, even_closed=even_closed)
 
     def _run(self, work: Work, key: str, *, even_closed: bool) -> None:
-        """Run queued work; show its error on the page, and raise an unexpected one again."""
+        """Run queued work; show its error on the page, and print an unexpected one."""
         with self.lock:
             self.pending.discard(key)
         if self.closed.is_set() and not even_closed:
@@ -329,19 +327,9 @@ class Session:
         except (MorphgenError, RecursionError) as error:
             self.report_error(error)
         except Exception:
-            if not self.closed.is_set():
+            if not self.closed.is_set():  # else expected: the work needed the browser
+                traceback.print_exc()
                 self.report_error(BUG)
-            raise
-
-    def _print_bug(self, future: Future[None]) -> None:
-        """Print the traceback of an unexpected error, which a thread pool would hide.
-
-        Errors after the browser has disconnected are expected: the work needed the browser.
-        """
-        if future.cancelled() or self.closed.is_set():
-            return
-        if (error := future.exception()) is not None:
-            traceback.print_exception(error, file=sys.stderr)
 
 
 def set_value(handle: Any, value: object) -> None:  # noqa: ANN401

@@ -9,7 +9,6 @@ import viser
 
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.grammar.grammar_file import grammar_names
-from morphgen.grammar.robot_set import INDEX
 from morphgen.splits.split import SIDES
 from morphgen.splits.split_file import split_names
 from morphgen.viewer import markup
@@ -68,8 +67,7 @@ def show(session: Session) -> None:
         return
     folder = session.address.subject
     rows = folder_rows(folder, session.files)
-    is_set = (session.files.path(folder) / INDEX).is_file()
-    gallery = Gallery(session, folder, rows, scale="common" if is_set else "own")
+    gallery = Gallery(session, folder, rows)
     names = robot_subfolders(session.files.path(folder))
     below = [f"{folder.rstrip('/')}/{name}" for name in names]
     links = " · ".join(markup.link(Address("gallery", (path,)), path) for path in below)
@@ -110,7 +108,7 @@ def show_chosen(session: Session) -> None:
     if not session.chosen:
         raise MorphgenError(NONE_CHOSEN)
     rows = uri_rows(session.chosen, session.files)
-    gallery = Gallery(session, "Chosen robots", rows, SIDES, "common")
+    gallery = Gallery(session, "Chosen robots", rows, SIDES)
     header = "The first robots that you chose are to train on, the others to test on."
     open_panels(gallery, markup.breadcrumbs(("chosen robots", None)), markup.dim(header))
     num_train = session.client.gui.add_slider("to train on", 0, len(rows), 1, max(len(rows) - 1, 1))

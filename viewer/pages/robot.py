@@ -58,7 +58,7 @@ from morphgen.viewer.robot_uri import (
 from morphgen.viewer.scene import overlays as scene_overlays
 from morphgen.viewer.scene import robot as scene_robot
 from morphgen.viewer.scene import stage as scene_stage
-from morphgen.viewer.scene.overlays import NUM_POINTS, OFTEN, SELDOM, Overlays, remove_overlay
+from morphgen.viewer.scene.overlays import NUM_POINTS, OFTEN, SELDOM, remove_overlay
 
 WEB_PAGE = "robot.html"  # name of the web page in a bundle
 PANEL_WIDTH = 390.0  # width of the panel [pixels]
@@ -135,7 +135,6 @@ class RobotPage:
         scene_stage.add_scale_bar(scene, low, high, scene_stage.CAMERA_DIRECTION)
         scene_stage.look_at(session.client, low, high)
         self.view = scene_robot.add_robot(scene, robot, "/robot")
-        self.overlays = Overlays(self.view)
         self.q: Array = np.array(robot.home)  # independent joint positions (dof,) [rad or m]
         self.findings: tuple[Finding, ...] = ()  # findings of the checks, once they are there
         self._checker: SelfCollisionChecker | None = None
@@ -263,7 +262,7 @@ class RobotPage:
     def select(self, name: str) -> None:
         """Select a link: outline, card and slider; an empty name selects none."""
         set_value(self._link, name or NO_LINK)
-        scene_overlays.show_outline(self.overlays, self.robot.link_index[name] if name else None)
+        scene_overlays.show_outline(self.view, self.robot.link_index[name] if name else None)
         self._show_card()
         self._mark_slider()
         self.session.show_state()
@@ -301,7 +300,7 @@ class RobotPage:
             self._range_row = row
             with self.session.client.atomic():
                 joint = None if row is None else self.robot.independent_joints[row]
-                scene_overlays.show_range(self.overlays, joint)
+                scene_overlays.show_range(self.view, joint)
 
     def _connect_links(self) -> None:
         """Let clicks in the scene select links, and drags turn their joints."""
@@ -416,15 +415,15 @@ def parse_joints(text: str, robot: Robot) -> Array | None:
 
 
 GIZMO = "drag the tool"
-_SHOW_OVERLAY: Mapping[str, Callable[[Overlays], None]] = {
+_SHOW_OVERLAY: Mapping[str, Callable[[scene_robot.RobotView], None]] = {
     "joint axes": scene_overlays.show_joint_axes,
     "centres of mass": scene_overlays.show_mass_centres,
     "ignored pairs": scene_overlays.show_ignored_pairs,
     "names": scene_overlays.show_names,
 }
-TOGGLES = (*scene_robot.LAYERS, "x-ray", "frames", *_SHOW_OVERLAY, "workspace", "trail", GIZMO)
+TOGGLES = (*scene_robot.LAYERS, "x-ray", "frames", *_SHOW_OVERLAY, "workspace", GIZMO)
 """Layers, overlays and gizmo that can be shown of a robot, as named in the address."""
-TOOL_TOGGLES = ("workspace", "trail", GIZMO)  # toggles for robots with a tool only
+TOOL_TOGGLES = ("workspace", GIZMO)  # toggles for robots with a tool only
 _XRAY_OPACITY = 0.2  # opacity of visual shapes in the x-ray view
 _GROWTH = 0.002
 """Distance by which collision shapes and primitives are grown while visual shapes are shown, in
@@ -439,7 +438,7 @@ class Layers:
         """Add the check boxes, and the slider of the workspace's slice."""
         gui, session = page.session.client.gui, page.session
         self._page, self._session, self._robot = page, session, page.robot
-        self._view, self._overlays = page.view, page.overlays
+        self._view = page.view
         self._primitives: Sequence[Sequence[Shape]] | None = None  # by link, once they were shown
         self._workspace: tuple[Array, scene_stage.Triangles] | None = None
         """Tool positions (n, 3) [m] and their shell, once they are sampled."""
@@ -467,11 +466,9 @@ class Layers:
     def follow(self) -> None:
         """Draw what depends on the robot's configuration."""
         if self._is_on("ignored pairs"):
-            scene_overlays.show_ignored_pairs(self._overlays)
+            scene_overlays.show_ignored_pairs(self._view)
         if has_tool(self._robot):
             T_root_tool = frame_pose(self._robot, self._page.q)
-            if self._is_on("trail"):
-                scene_overlays.extend_trail(self._overlays, T_root_tool[:3, 3])
             if self._gizmo is not None and not self._is_dragging:
                 pose = Pose.from_matrix(T_root_tool)
                 self._gizmo.position, self._gizmo.wxyz = pose.position, pose.quaternion
@@ -506,9 +503,9 @@ class Layers:
             case "drag the tool":
                 self._toggle_gizmo(on)
             case _ if not on:
-                remove_overlay(self._overlays, name)
-            case _ if name in _SHOW_OVERLAY:  # the trail appears when the tool moves
-                _SHOW_OVERLAY[name](self._overlays)
+                remove_overlay(self._view, name)
+            case _:
+                _SHOW_OVERLAY[name](self._view)
         self._session.show_state()
 
     def _has_visual(self) -> bool:
@@ -541,10 +538,10 @@ class Layers:
 
     def show_inertia(self) -> None:
         """Draw the boxes of inertia with the findings about them, or remove both."""
-        remove_overlay(self._overlays, "inertia findings")
+        remove_overlay(self._view, "inertia findings")
         if self._is_on("inertia"):
             self._view.show_inertia()
-            scene_overlays.show_inertia_findings(self._overlays, self._page.findings)
+            scene_overlays.show_inertia_findings(self._view, self._page.findings)
         else:
             self._view.remove_layer("inertia")
 
@@ -566,7 +563,7 @@ class Layers:
         if on:
             self._session.run_in_background(self._sample_workspace)
             return
-        remove_overlay(self._overlays, "workspace")
+        remove_overlay(self._view, "workspace")
         self._slice.visible, self._legend.content = False, ""
         scene_stage.look_at(self._session.client, *scene_robot.robot_bounds(self._robot))
 
@@ -595,7 +592,7 @@ class Layers:
         """Draw the workspace, cut at the slider's position."""
         if self._workspace is not None and self._is_on("workspace"):
             with self._session.client.atomic():
-                scene_overlays.show_workspace(self._overlays, *self._workspace, self._slice.value)
+                scene_overlays.show_workspace(self._view, *self._workspace, self._slice.value)
             self._session.show_state_later()
 
     def _toggle_gizmo(self, on: bool) -> None:

@@ -52,7 +52,7 @@ def show(session: Session) -> None:
         return
     name = session.address.subject
     split = resolve_split(name, session.files)
-    gallery = Gallery(session, split.name, split_rows(name, split), SIDES, "common")
+    gallery = Gallery(session, split.name, split_rows(name, split), SIDES)
     gui = session.client.gui
     header = _description(split) + _rollout_link(name, split)
     width = min(PANEL_WIDTH, PANEL_SHARE * session.width)

@@ -1,10 +1,9 @@
-"""Drawings over a robot: axes, names, findings, workspace, trail, and marks of a selection."""
+"""Drawings over a robot: axes, names, findings, workspace, and marks of a selection."""
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -73,7 +72,6 @@ def cut(points: Array, y: float) -> Slice:
     return Slice(centres, side, filled[i, k] / max(float(filled.max()), 1e-9))
 
 
-TRAIL_LENGTH = 400  # tool positions that a trail keeps
 _ORANGE, _BLUE, _GREY, _BLACK = (247, 103, 7), (25, 113, 194), (134, 142, 150), (33, 37, 41)
 _AMBER: Rgb = (232, 89, 12)  # colour of the inertia of links with findings about it
 _SHELL: Rgb = (76, 110, 245)
@@ -83,22 +81,10 @@ _INERTIA_CODES = ("inertia", "mass", "com-", "density")  # beginnings of codes a
 _NAME_DISTANCE = 0.045  # distance below which links share a label, in extents of the robot
 
 
-@dataclass(eq=False)
-class Overlays:
-    """The overlays of a robot."""
-
-    view: RobotView
-    nodes: dict[str, list[Any]] = field(default_factory=dict)  # viser's scene nodes by overlay
-    trail: deque[Array] = field(default_factory=lambda: deque(maxlen=TRAIL_LENGTH))
-    """Recent tool positions [m]."""
-
-
-def remove_overlay(overlays: Overlays, name: str) -> None:
+def remove_overlay(view: RobotView, name: str) -> None:
     """Remove an overlay."""
-    for node in overlays.nodes.pop(name, []):
+    for node in view.overlays.pop(name, []):
         node.remove()
-    if name == "trail":
-        overlays.trail.clear()
 
 
 def _centre(link: Link) -> Vec3:
@@ -117,11 +103,10 @@ def _add_label(view: RobotView, i: int, name: str, text: str) -> Any:  # noqa: A
     )
 
 
-def show_joint_axes(overlays: Overlays) -> None:
+def show_joint_axes(view: RobotView) -> None:
     """Draw an arrow along every movable joint's axis: orange rotates, blue slides."""
-    view = overlays.view
     length = 0.14 * robot_extent(view.robot)
-    overlays.nodes["joint axes"] = [
+    view.overlays["joint axes"] = [
         view.scene.add_arrows(
             f"{view.name}/{k + 1}/axis",  # joint k attaches link k + 1
             np.array([[np.zeros(3), length * np.array(view.robot.joints[k].unit_axis)]]),
@@ -134,12 +119,11 @@ def show_joint_axes(overlays: Overlays) -> None:
     ]
 
 
-def show_mass_centres(overlays: Overlays) -> None:
+def show_mass_centres(view: RobotView) -> None:
     """Draw a ball at every link's centre of mass; its volume is proportional to the mass."""
-    view = overlays.view
     inertials = {i: link.inertial for i, link in enumerate(view.robot.links) if link.inertial}
     heaviest = max((inertial.mass for inertial in inertials.values()), default=0.0)
-    overlays.nodes["centres of mass"] = [
+    view.overlays["centres of mass"] = [
         view.scene.add_icosphere(
             f"{view.name}/{i}/com",
             radius=0.022 * robot_extent(view.robot) * (inertial.mass / heaviest) ** (1 / 3),
@@ -151,10 +135,9 @@ def show_mass_centres(overlays: Overlays) -> None:
     ]
 
 
-def show_ignored_pairs(overlays: Overlays) -> None:
+def show_ignored_pairs(view: RobotView) -> None:
     """Draw a line between the centres of mass of links whose contacts are ignored."""
-    remove_overlay(overlays, "ignored pairs")
-    view = overlays.view
+    remove_overlay(view, "ignored pairs")
     centres = np.array([_centre(link) for link in view.robot.links])
     rotations, origins = view.T_root_link[:, :3, :3], view.T_root_link[:, :3, 3]
     points = np.einsum("nij,nj->ni", rotations, centres) + origins
@@ -168,12 +151,11 @@ def show_ignored_pairs(overlays: Overlays) -> None:
         node = view.scene.add_line_segments(
             f"{view.name}/ignored", np.array(lines), _GREY, thickness=2.0, thickness_units="screen"
         )
-        overlays.nodes["ignored pairs"] = [node]
+        view.overlays["ignored pairs"] = [node]
 
 
-def show_names(overlays: Overlays) -> None:
+def show_names(view: RobotView) -> None:
     """Write the name of every link at its centre of mass; near ones share a label."""
-    view = overlays.view
     near = _NAME_DISTANCE * robot_extent(view.robot)
     groups: list[tuple[int, Array, list[str]]] = []
     for i, link in enumerate(view.robot.links):
@@ -184,16 +166,16 @@ def show_names(overlays: Overlays) -> None:
             groups.append((i, position, [link.name]))
         else:
             group[2].append(link.name)
-    overlays.nodes["names"] = [
+    view.overlays["names"] = [
         _add_label(view, i, "name", f"{first} + {len(more)}" if more else first)
         for i, _, (first, *more) in groups
     ]
 
 
-def show_inertia_findings(overlays: Overlays, findings: Sequence[Finding]) -> None:
+def show_inertia_findings(view: RobotView, findings: Sequence[Finding]) -> None:
     """Write findings about mass and inertia beside the links' boxes, and colour these boxes."""
-    remove_overlay(overlays, "inertia findings")
-    view, nodes, colours = overlays.view, [], {}
+    remove_overlay(view, "inertia findings")
+    nodes, colours = [], {}
     for i, link in enumerate(view.robot.links):
         about = [
             finding
@@ -206,16 +188,16 @@ def show_inertia_findings(overlays: Overlays, findings: Sequence[Finding]) -> No
         text = f"{link.name}: {', '.join(finding.code for finding in about)}"
         nodes.append(_add_label(view, i, "inertia_finding", text))
     view.paint("inertia", colours)
-    overlays.nodes["inertia findings"] = nodes
+    view.overlays["inertia findings"] = nodes
 
 
-def show_workspace(overlays: Overlays, points: Array, outside: Triangles, y: float) -> None:
+def show_workspace(view: RobotView, points: Array, outside: Triangles, y: float) -> None:
     """Draw the shell of the tool's positions behind a vertical plane at y [m], and the slice in it.
 
     points: Tool positions, shape (n, 3) [m]; ``outside`` is their shell.
     """
-    remove_overlay(overlays, "workspace")
-    view, section, (vertices, faces) = overlays.view, cut(points, y), outside
+    remove_overlay(view, "workspace")
+    section, (vertices, faces) = cut(points, y), outside
     nodes: list[Any] = [
         view.scene.add_mesh_simple(
             f"{view.name}/workspace",
@@ -243,26 +225,7 @@ def show_workspace(overlays: Overlays, points: Array, outside: Triangles, y: flo
                 cast_shadow=False,
             )
         )
-    overlays.nodes["workspace"] = nodes
-
-
-def extend_trail(overlays: Overlays, position: Array) -> None:
-    """Extend the trail of the tool to a position, unless it has not moved (10 um)."""
-    if overlays.trail and np.linalg.norm(overlays.trail[-1] - position) < 1e-5:
-        return
-    overlays.trail.append(position)
-    for node in overlays.nodes.pop("trail", []):
-        node.remove()
-    if len(overlays.trail) > 1:
-        positions = np.array(overlays.trail)
-        node = overlays.view.scene.add_line_segments(
-            f"{overlays.view.name}/trail",
-            np.stack([positions[:-1], positions[1:]], axis=1),
-            _ORANGE,
-            thickness=3.0,
-            thickness_units="screen",
-        )
-        overlays.nodes["trail"] = [node]
+    view.overlays["workspace"] = nodes
 
 
 SELECTED: Rgb = (0, 190, 220)  # outline, slider and card of the link; red means collision only
@@ -273,20 +236,19 @@ _RADIUS = 0.18  # radius of the arc that shows a range, in extents of the robot
 _ARC_STEPS = 48
 
 
-def show_outline(overlays: Overlays, link: int | None) -> None:
+def show_outline(view: RobotView, link: int | None) -> None:
     """Draw the outline of a link's visual shapes; without a link, of none.
 
     It is the surface moved outwards and turned inside out: where only front faces are drawn, it is
     visible around the shapes and nowhere else.
     """
-    remove_overlay(overlays, "outline")
+    remove_overlay(view, "outline")
     if link is None:
         return
-    view = overlays.view
     thickness = _OUTLINE * robot_extent(view.robot)
     shapes = view.robot.links[link].visuals or view.robot.links[link].collisions
     surfaces = [grown_triangles(shape.geometry, thickness) for shape in shapes]
-    overlays.nodes["outline"] = [
+    view.overlays["outline"] = [
         view.scene.add_mesh_simple(
             f"{view.name}/{link}/outline{i}",
             vertices,
@@ -303,12 +265,11 @@ def show_outline(overlays: Overlays, link: int | None) -> None:
     ]
 
 
-def show_range(overlays: Overlays, index: int | None) -> None:
+def show_range(view: RobotView, index: int | None) -> None:
     """Draw the axis and range of a joint on its parent link, and a needle on its child link."""
-    remove_overlay(overlays, "range")
+    remove_overlay(view, "range")
     if index is None:
         return
-    view = overlays.view
     robot, joint = view.robot, view.robot.joints[index]
     parent, child = robot.parents[index + 1], index + 1
     size = _RADIUS * robot_extent(robot)
@@ -326,7 +287,7 @@ def show_range(overlays: Overlays, index: int | None) -> None:
             wxyz=T_parent_joint.quaternion if at else (1.0, 0.0, 0.0, 0.0),
         )
 
-    overlays.nodes["range"] = [
+    view.overlays["range"] = [
         add("range", parent, tracks, RANGE, 4.0, at=True),
         add("range_axis", parent, axis, RANGE, 2.0, at=True),
         add("range_needle", child, needle, SELECTED, 5.0, at=False),

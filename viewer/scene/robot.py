@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import viser
@@ -56,6 +56,8 @@ class RobotView:
     links: list[viser.FrameHandle]  # frames of the links, in the order of `robot.links`
     layers: dict[Layer, list[list[DrawnShape]]] = field(default_factory=dict)
     """Shapes by link of the layers drawn so far."""
+    overlays: dict[str, list[Any]] = field(default_factory=dict)
+    """Nodes of the drawings over the robot by their names; see ``scene.overlays``."""
     red: frozenset[str] = frozenset()  # names of the links that are painted red
     T_root_link: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     """Current pose of every link in the root frame, shape (n_links, 4, 4)."""
