@@ -17,7 +17,7 @@ from morphgen.errors import RobotError
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import movable_positions, random_configurations
 from morphgen.model.robot import Pair, Robot, sorted_pair
-from morphgen.model.tree import RigidGroup, rigid_groups
+from morphgen.model.tree import rigid_groups
 from morphgen.typing import Array
 
 if TYPE_CHECKING:
@@ -224,20 +224,15 @@ def adjacent_pairs(robot: Robot) -> tuple[Pair, ...]:
     """
     groups = rigid_groups(robot)
     group_of = {link.name: i for i, group in enumerate(groups) for link in group.links}
-    collidable = [[link.name for link in group.links if link.collisions] for group in groups]
-
-    def parent_of(group: RigidGroup) -> int | None:
-        parent = robot.parents[robot.link_index[group.links[0].name]]
-        return group_of[robot.links[parent].name] if parent >= 0 else None
-
+    nearest: list[list[str]] = []  # of each group, or of the next one above that has shapes
     pairs: set[Pair] = set()
-    for names, group in zip(collidable, groups, strict=True):
+    for group in groups:
+        names = [link.name for link in group.links if link.collisions]
+        parent = robot.parents[robot.link_index[group.links[0].name]]
+        above = nearest[group_of[robot.links[parent].name]] if parent >= 0 else []
         pairs.update(_pairs(names))
-        parent = parent_of(group)
-        while parent is not None and not collidable[parent]:
-            parent = parent_of(groups[parent])
-        if parent is not None:
-            pairs.update(sorted_pair(a, b) for a, b in product(names, collidable[parent]))
+        pairs.update(sorted_pair(a, b) for a, b in product(names, above))
+        nearest.append(names or above)
     return tuple(sorted(pairs))
 
 
