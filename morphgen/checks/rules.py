@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -520,22 +521,18 @@ def _are_primitives_near(a: Sequence[Shape], b: Sequence[Shape], T_a_b: Array) -
     """
     import fcl  # here and below, because commands that check no robot should start quickly
 
-    def objects(shapes: Sequence[Shape], T_a_link: Array) -> list[fcl.CollisionObject]:
-        found = []
+    def objects(shapes: Sequence[Shape], T_a_link: Array) -> Iterator[fcl.CollisionObject]:
         for shape in shapes:
             if not isinstance(shape.geometry, Mesh):
                 T = T_a_link @ shape.T_link_shape.matrix
                 # FCL has the same primitives, with the same names and dimensions.
-                make = getattr(fcl, type(shape.geometry).__name__)
-                geometry, T = make(*dimensions(shape.geometry)), fcl.Transform(T[:3, :3], T[:3, 3])
-                found.append(fcl.CollisionObject(geometry, T))
-        return found
+                primitive = getattr(fcl, type(shape.geometry).__name__)
+                transform = fcl.Transform(T[:3, :3], T[:3, 3])
+                yield fcl.CollisionObject(primitive(*dimensions(shape.geometry)), transform)
 
-    objects_b = objects(b, T_a_b)
     return any(
-        fcl.distance(object_a, object_b, fcl.DistanceRequest(), fcl.DistanceResult()) <= MAX_GAP
-        for object_a in objects(a, np.eye(4))
-        for object_b in objects_b
+        fcl.distance(*pair, fcl.DistanceRequest(), fcl.DistanceResult()) <= MAX_GAP
+        for pair in product(objects(a, np.eye(4)), objects(b, T_a_b))
     )
 
 
