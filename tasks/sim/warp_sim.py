@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import logging
+import os
+import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import mujoco
 import numpy as np
@@ -333,6 +337,7 @@ def _array(values: object, dtype: Callable[..., object]) -> wp.array:
 
 
 _log = logging.getLogger(__name__)
+REPORT_AFTER = 10.0  # time after which loading reports its progress again [s]
 DIVERGED = "a target or the state is not finite, or a velocity is too large"
 
 
@@ -449,15 +454,14 @@ class _Streams:
     """A stream and a captured graph for each group, so that groups run side by side."""
 
     def __init__(self, device: str, groups: Sequence[Group]) -> None:
-        """Capture the control step of each group, after one step that loads the kernels."""
-        if not kernels_stored(wp.get_device(device).arch):
-            _log.warning("compiling MuJoCo Warp for this GPU: about three minutes, once")
+        """Load the kernels and capture the control step of each group."""
+        load_kernels(groups, device)
         self._device = device
         self._streams = [wp.Stream(device) for _ in groups]
         self._graphs: list[wp.Graph] = []
         for stream, group in zip(self._streams, groups, strict=True):
             with wp.ScopedDevice(device), wp.ScopedStream(stream):
-                group.step()
+                group.step()  # loads what ``kernels_of`` missed: a capture cannot
                 with wp.ScopedCapture(stream=stream) as capture:
                     group.step()
                 self._graphs.append(capture.graph)
@@ -471,6 +475,58 @@ class _Streams:
             stream.wait_event(begun)
             wp.capture_launch(graph, stream=stream)
             main.wait_event(stream.record_event())
+
+
+def load_kernels(groups: Sequence[Group], device: str) -> None:
+    """Compile and load the kernels of a step of the groups, as many at once as there are cores.
+
+    Warp alone loads a module when a kernel of it is launched first, one after the other: on an
+    H100 with 16 cores the first start took 183 s so, and takes 27 s.
+    """
+    modules = kernels_of(groups, device)
+    workers = len(os.sched_getaffinity(0))
+    if not kernels_stored(wp.get_device(device).arch):
+        _log.warning("compiling %s parts of MuJoCo Warp for this GPU, once", len(modules))
+    last = time.monotonic()
+    with ThreadPoolExecutor(workers) as pool:
+        loads = [pool.submit(module.load, wp.get_device(device), size) for module, size in modules]
+        for done, load in enumerate(as_completed(loads), 1):
+            load.result()
+            if time.monotonic() > last + REPORT_AFTER:
+                last = time.monotonic()
+                _log.warning("compiled %s of %s parts of MuJoCo Warp", done, len(modules))
+
+
+def kernels_of(groups: Sequence[Group], device: str) -> list[tuple[wp.Module, int | None]]:
+    """Return the modules whose kernels a step of the groups launches, each with a block size.
+
+    The step is run with kernels that load nothing, which Warp does not launch.
+    """
+    found: dict[tuple[wp.Module, int | None], None] = {}
+
+    def note(module: wp.Module, _device: object, block_dim: int | None = None) -> None:
+        found[module, block_dim] = None
+
+    def call(_condition: object, **named: Any) -> None:  # noqa: ANN401  # arguments of bodies
+        names = ("while_body", "on_true", "on_false", "stream")
+        while_body, on_true, on_false, _ = (named.pop(name, None) for name in names)
+        for body in filter(None, (while_body, on_true, on_false)):
+            body(**named)
+
+    def block_size(kernel: wp.Kernel, _device: object) -> tuple[int, int]:
+        found[kernel.module, None] = None
+        return 256, 1  # Warp's default
+
+    with (
+        mock.patch.object(wp.Module, "load", note),
+        mock.patch.object(wp, "capture_while", call),
+        mock.patch.object(wp, "capture_if", call),
+        mock.patch.object(wp, "get_suggested_block_size", block_size),
+        wp.ScopedDevice(device),
+    ):
+        for group in groups:
+            group.step()
+    return list(found)
 
 
 def kernels_stored(arch: int) -> bool:

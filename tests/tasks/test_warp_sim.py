@@ -247,6 +247,21 @@ def test_without_a_gpu_the_simulator_is_refused_by_name():
         make_batch("reach", ["arm3"], 1, sim="warp", device="cuda")
 
 
+def test_the_kernels_of_a_step_are_known_before_it_is_launched(shared, monkeypatch):
+    before, wanted, load = shared.q.clone(), [], wp.Module.load
+
+    def noted(module, device, block_dim=None):
+        wanted.append((module, block_dim))
+        return load(module, device, block_dim)
+
+    found = warp_sim.kernels_of(shared._groups, "cpu")
+    assert torch.equal(shared.q, before)
+    monkeypatch.setattr(wp.Module, "load", noted)
+    shared.step(shared.q)
+    assert len(set(wanted)) > 20
+    assert set(wanted) <= set(found)
+
+
 def test_kernels_of_another_gpu_do_not_count_as_compiled(tmp_path, monkeypatch):
     monkeypatch.setattr(warp_sim.wp.config, "kernel_cache_dir", str(tmp_path))
     (tmp_path / "module").mkdir()
