@@ -294,11 +294,9 @@ class BulletScene:
         ]
         block = self._scene.block
         self.block = -1
-        self._weight: tuple[float, float, float] | None = None
         if block is not None:
             self.block = self._add(self._box(block), block.friction, _BLOCK)
-            if block.mass > 0:
-                self._weight = (0.0, 0.0, -GRAVITY * block.mass)
+            self._weight = (0.0, 0.0, -GRAVITY * block.mass)
 
     def _box(self, block: Block) -> int:
         """Add a box; return PyBullet's body."""
@@ -339,19 +337,17 @@ class BulletScene:
         """Put robot, at positions of all movable joints, and block at rest; clear contacts."""
         for joint, position in zip(self.driven, positions, strict=True):
             pybullet.resetJointState(self.robot, joint, position, **self._client)
+        moved = (
+            [] if obstacle_poses is None else [*zip(self._obstacles, obstacle_poses, strict=True)]
+        )
         if self.block >= 0:
-            x, y, z, qw, qx, qy, qz = block_pose
-            pybullet.resetBasePositionAndOrientation(
-                self.block, (x, y, z), (qx, qy, qz, qw), **self._client
-            )
+            moved.append((self.block, block_pose))
             pybullet.resetBaseVelocity(self.block, (0, 0, 0), (0, 0, 0), **self._client)
-            self._block_position = (x, y, z)  # where its weight acts in the next step
-        if obstacle_poses is not None:
-            for body, pose in zip(self._obstacles, obstacle_poses, strict=True):
-                x, y, z, qw, qx, qy, qz = pose
-                pybullet.resetBasePositionAndOrientation(
-                    body, (x, y, z), (qx, qy, qz, qw), **self._client
-                )
+            self._block_position = tuple(block_pose[:3])  # where its weight acts in the next step
+        for body, (x, y, z, qw, qx, qy, qz) in moved:
+            pybullet.resetBasePositionAndOrientation(
+                body, (x, y, z), (qx, qy, qz, qw), **self._client
+            )
         for entry in self._groups:
             pybullet.setCollisionFilterGroupMask(*entry, **self._client)
 
@@ -366,7 +362,7 @@ class BulletScene:
                 forces=forces,
                 **self._motors,
             )
-        if self._weight is not None:
+        if self.block >= 0:
             pybullet.applyExternalForce(
                 self.block,
                 -1,

@@ -432,11 +432,13 @@ class WarpSimulation(Simulation):
     def faults(self) -> dict[int, str]:
         """Return why environments diverged in the last step; see ``Simulation.faults``."""
         overflow, diverged = (self._tensors[name].tolist() for name in ("overflow", "diverged"))
-        return {
-            env: f"{self._label(env)}: diverged: {_fault(overflow[env])}"
-            for env, is_fault in enumerate(diverged)
-            if is_fault
-        }
+        faults = {}
+        for env, bits in enumerate(overflow):
+            if diverged[env]:
+                name = OverflowType(bits & int(OverflowType.ALL)).name
+                memory = f"its contacts do not fit into MuJoCo Warp's memory ({name})"
+                faults[env] = f"{self._label(env)}: diverged: {memory if bits else DIVERGED}"
+        return faults
 
     def close(self) -> None:
         """Free everything; a second call does nothing."""
@@ -532,14 +534,6 @@ def kernels_of(groups: Sequence[Group], device: str) -> list[tuple[wp.Module, in
 def kernels_stored(arch: int) -> bool:
     """Return whether an earlier start compiled kernels for GPUs of an architecture."""
     return any(Path(wp.config.kernel_cache_dir).rglob(f"*.sm{arch}.cubin"))
-
-
-def _fault(overflow: int) -> str:
-    """Return why a world diverged."""
-    if overflow:
-        bits = OverflowType(overflow & int(OverflowType.ALL))
-        return f"its contacts do not fit into MuJoCo Warp's memory ({bits.name})"
-    return DIVERGED
 
 
 SIMULATOR = Simulator(

@@ -84,8 +84,8 @@ ROBOTS = {
     "parallelogram": parallelogram,
     "heavy followers": heavy_followers,
     "folding": folding,
-    "robotiq_2f85": lambda: compose("arm=ur5 ee=robotiq_2f85"),
-    "gen3_lite_2f": lambda: compose("arm=ur5 ee=gen3_lite_2f"),
+    "robotiq_2f85": lambda: compose("arm=ur5 ee=robotiq_2f85", geometry="primitive"),
+    "gen3_lite_2f": lambda: compose("arm=ur5 ee=gen3_lite_2f", geometry="primitive"),
 }
 
 
