@@ -60,7 +60,7 @@ class RemoteRollout(EpisodeSource):
     def __init__(self, config: RolloutConfig, files: FileAccess, process: Workers) -> None:
         """Start an episode."""
         self._process, self._key = process, secrets.token_hex(8)
-        source = process.result(process.submit(simulation("start"), self._key, config, files))
+        source = process.call(simulation("start"), self._key, config, files)
         super().__init__(source.episode, source.max_steps)
         self.faults = source.faults
         self._next: Future[Any] | None = process.submit(simulation("advance"), self._key)

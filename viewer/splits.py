@@ -138,7 +138,7 @@ def study_split(
     for i, future in enumerate(futures, 1):
         robots.append(workers.result(future))
         report(i, len(futures))
-    return workers.result(workers.submit(conclude_study, split, robots, folders))
+    return workers.call(conclude_study, split, robots, folders)
 
 
 def conclude_study(

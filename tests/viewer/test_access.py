@@ -136,6 +136,7 @@ def test_pages_are_served_only_to_own_host_names(viewer, capfd):
     port = viewer().port
     answer, page = fetched(port, Host=f"localhost:{port}")
     assert (answer.status, b"<html" in page) == (200, True)
+    assert b">Playback</a>" in page  # the bar is there before a page is built
     assert f"connect-src 'self' ws://localhost:{port} " in answer.headers["Content-Security-Policy"]
     assert "frame-ancestors 'self' ;" in answer.headers["Content-Security-Policy"]
     for headers in (

@@ -88,7 +88,10 @@ def test_a_rollout_of_the_process_of_simulations_is_the_same(episode, files, mod
         future.set_result(pickle.loads(pickle.dumps(work(*arguments))))
         return future
 
-    process = SimpleNamespace(submit=submit, result=Future.result)
+    def call(work, *arguments):
+        return submit(work, *arguments).result()
+
+    process = SimpleNamespace(submit=submit, result=Future.result, call=call)
     config = RolloutConfig("reach", (CUBE, "robots/none", "robots/one"), "jacobian", 3)
     remote = RemoteRollout(config, files, process)
     assert (list(remote.faults), remote.max_steps) == (["robots/none"], 300)

@@ -44,7 +44,10 @@ def frame_page(response: Response) -> None:
 
 @cache
 def _frame() -> bytes:
-    return files("morphgen.viewer").joinpath("frame.html").read_bytes()
+    """Return the frame with the bar of the first page, which is there before a page is built."""
+    text = files("morphgen.viewer").joinpath("frame.html").read_text(encoding="utf-8")
+    links = bar_html(Address("library"), (), dark=False)
+    return text.replace('"pages">', f'"pages">{links}', 1).encode()
 
 
 @lru_cache(maxsize=2)

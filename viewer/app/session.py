@@ -101,7 +101,7 @@ class Session:
 
     def run_in_worker(self, work: Callable[..., T], *arguments: object) -> T:
         """Run a function in a worker process and return its result."""
-        return self.workers.result(self.workers.submit(work, *arguments))
+        return self.workers.call(work, *arguments)
 
     @contextmanager
     def activity(self, text: str) -> Iterator[None]:

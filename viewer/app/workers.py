@@ -54,6 +54,10 @@ class Workers:
                 "a worker process died, perhaps for lack of memory; others were started: try again"
             ) from error
 
+    def call(self, work: Callable[..., T], *arguments: object) -> T:
+        """Call a function in a process and return its result."""
+        return self.result(self.submit(work, *arguments))
+
     def close(self) -> None:
         """End the processes; calls that run or wait are dropped."""
         with self._lock:

@@ -326,8 +326,8 @@ def complete_address(session: Session) -> Robots:
     policy = session.address.state.get("policy", "")
     if not policy or is_named(policy):
         return []
-    call = session.simulator.submit(simulation("training_robots"), policy, session.files)
-    task, obstacles, trained_on = session.simulator.result(call)
+    find_robots = simulation("training_robots")
+    task, obstacles, trained_on = session.simulator.call(find_robots, policy, session.files)
     if not session.address.subject:
         address = replace(session.address, subjects=(task,))
         session.address = address.with_state(obstacles="yes" if obstacles else "")
