@@ -80,11 +80,6 @@ def slots_of(words: Words, library: Library) -> list[str]:
     return list(dict.fromkeys(slots))
 
 
-def part_options(slot: str, library: Library) -> list[str]:
-    """Return the parts that fit a slot, after the option to leave it empty."""
-    return [NO_PART, *(name for name in library.names(kind_of(slot)) if name != "none")]
-
-
 def parameters_of(slot: str, part: str, library: Library) -> Mapping[str, Parameter]:
     """Return the parameters of a part in a slot: its own, and the rotation of its mount."""
     manifest = library.manifest(part, kind_of(slot))
@@ -229,9 +224,10 @@ class PartsTab(ComposingTab):
                         self._add_slider(name, parameter, value, key, change)
 
     def _add_part_dropdown(self, slot: str) -> None:
-        names, chosen = part_options(slot, self._library), self._words.get(slot)
+        kind, chosen = kind_of(slot), self._words.get(slot)
+        names = (NO_PART, *(name for name in self._library.names(kind) if name != "none"))
         dropdown = self._session.client.gui.add_dropdown(
-            kind_of(slot), tuple(names), initial_value=chosen if chosen in names else NO_PART
+            kind, names, initial_value=chosen if chosen in names else NO_PART
         )
         self._session.on_change(dropdown, lambda: self._choose(slot, dropdown.value))
 
