@@ -321,7 +321,13 @@ def open_panels(
     """Open the panel of controls at the right, and return that of thumbnails at the left."""
     client = gallery.session.client
     gui = client.gui
-    gallery.session.open_panel(width, breadcrumbs + (markup.framed(header) if header else ""))
+    # The open panel of cards lies over the strip that viser keeps free for its scene.
+    left = '[data-dock-region="left"]:not(:has([data-dock-column-rail]))'
+    cover = (
+        f"<style>{left}{{width:calc(100% - {width}px)!important}}"
+        f"{left} :has(>[data-dock-column]){{width:100%!important}}</style>"
+    )
+    gallery.session.open_panel(width, breadcrumbs + markup.framed(header) + cover)
     panel = gui.add_panel()
     with panel.add_tab(gallery.title, viser.Icon.LAYOUT_GRID):
         gallery.grid = gui.add_html("")
