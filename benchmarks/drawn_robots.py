@@ -28,7 +28,7 @@ from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.ppo import Learner
 from morphgen.rl.runs import robot_source as drawn_robots
 from morphgen.rl.runs.checkpoint import RunConfig
-from morphgen.rl.runs.robot_source import RobotSource, draw, drawn_source
+from morphgen.rl.runs.robot_source import GrammarSource, draw, drawn_source
 from morphgen.rl.runs.training import SLICE_STEPS, TrainingBatches, use_batch
 from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
 from morphgen.tasks.task import TaskConfig
@@ -66,7 +66,7 @@ def main() -> None:
     print(tabulate(shares, headers, floatfmt=("", "", ".1f", ".2f", ".1%")))
 
 
-def measure_drawing(source: RobotSource, tasks: tuple[TaskConfig, ...]) -> float:
+def measure_drawing(source: GrammarSource, tasks: tuple[TaskConfig, ...]) -> float:
     """Return the CPU seconds of drawing all robots."""
     drawn_robots._drawn.clear()
     start = time.process_time()
@@ -75,7 +75,7 @@ def measure_drawing(source: RobotSource, tasks: tuple[TaskConfig, ...]) -> float
 
 
 def measure_slice(
-    source: RobotSource, tasks: tuple[TaskConfig, ...], sim: str, agent: str, num_envs: int
+    source: GrammarSource, tasks: tuple[TaskConfig, ...], sim: str, agent: str, num_envs: int
 ) -> tuple[float, float, float]:
     """Return CPU seconds of a slice and of building its batch, and their ratio.
 

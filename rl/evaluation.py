@@ -19,7 +19,16 @@ from morphgen.rl.baselines.simple import Random
 from morphgen.rl.config import differences
 from morphgen.rl.inference import Episode, Mode, Policy, PolicyController, run_episodes
 from morphgen.rl.runs.checkpoint import Interface, RunConfig, read_checkpoint
-from morphgen.rl.runs.robot_source import RobotSource, members, other_side, specs_of, tasks_of
+from morphgen.rl.runs.robot_source import (
+    OneRobot,
+    Source,
+    SplitSource,
+    members,
+    other_side,
+    side_of,
+    specs_of,
+    tasks_of,
+)
 from morphgen.rl.runs.training import checkpoint_files
 from morphgen.rl.scores import (
     LISTS,
@@ -83,7 +92,7 @@ def evaluate_run(
 
 def evaluate_checkpoints(
     paths: Sequence[Path],
-    source: RobotSource,
+    source: Source,
     config: EvalConfig,
     mode: Mode,
     *,
@@ -102,17 +111,17 @@ def evaluate_checkpoints(
 
     controllers = [partial(make, learner) for _, learner in trained]
     runs = [run for run, _ in trained]
-    if all(run.source.member for run in runs) and _is_member(runs[0].source, source):
+    robots = [_trained_robot(run.source, source) for run in runs]
+    if all(robots):
         scores: list[Score] = []
-        for run, controller in zip(runs, controllers, strict=True):
-            robot = replace(source, member=run.source.member)
-            scores += evaluate([controller], robot, config, run.interface)
+        for run, robot, controller in zip(runs, robots, controllers, strict=True):
+            scores += evaluate([controller], robot or source, config, run.interface)
         return scores
     _require_same_interface(paths, runs)
     return evaluate(controllers, source, config, runs[0].interface)
 
 
-def require_trained_tasks(run: RunConfig, sources: Iterable[RobotSource], name: str) -> None:
+def require_trained_tasks(run: RunConfig, sources: Iterable[Source], name: str) -> None:
     """Require that a policy was trained on all tasks of robots."""
     trained = tasks_of(run.source)
     for task in (task for source in sources for task in tasks_of(source)):
@@ -132,14 +141,17 @@ def _require_same_interface(paths: Sequence[Path], runs: Sequence[RunConfig]) ->
             )
 
 
-def _is_member(robot: RobotSource, side: RobotSource) -> bool:
-    """Return whether one source is a single robot of the other, a whole side of a split."""
-    if not side.split or side.member is not None or robot.side != side.side:
-        return False
-    return members(replace(robot, member=None)) == members(side)
+def _trained_robot(trained: Source, source: Source) -> SplitSource | None:
+    """Return the robot of a side of a split that alone was trained on; None if there is none."""
+    if not (isinstance(trained, SplitSource) and isinstance(source, SplitSource)):
+        return None
+    if trained.member is None or source.member is not None or trained.side != source.side:
+        return None
+    is_same = members(replace(trained, member=None)) == members(source)
+    return replace(source, member=trained.member) if is_same else None
 
 
-def evaluate_baseline(name: str, source: RobotSource, config: EvalConfig) -> list[Score]:
+def evaluate_baseline(name: str, source: Source, config: EvalConfig) -> list[Score]:
     """Evaluate a baseline with continuous actions; robots whose task it cannot do are left out."""
     baseline = BASELINES[name]
     make = partial(baseline.make, config.seed)
@@ -148,7 +160,7 @@ def evaluate_baseline(name: str, source: RobotSource, config: EvalConfig) -> lis
 
 def evaluate(
     controllers: Sequence[MakeController],
-    source: RobotSource,
+    source: Source,
     config: EvalConfig,
     interface: Interface,
     *,
@@ -171,14 +183,15 @@ def evaluate(
             robot_episodes.extend(new)
     random_episodes = _random_episodes(source, replace(config, workers=1), tasks)
     hashes = {member.name: member.robot_hash for member in members(source)}
+    of_one = source.robot_hash if isinstance(source, OneRobot) else ""
     return [
-        _score(spec, source.side, hashes.get(spec.robot.name, source.robot_hash), own, of_random)
+        _score(spec, side_of(source), hashes.get(spec.robot.name, of_one), own, of_random)
         for spec, own, of_random in zip(specs, episodes, random_episodes, strict=True)
     ]
 
 
 @show_progress(None)  # goal sets are not episodes
-def _specs(source: RobotSource, config: EvalConfig, tasks: tuple[str, ...] | None) -> list[EnvSpec]:
+def _specs(source: Source, config: EvalConfig, tasks: tuple[str, ...] | None) -> list[EnvSpec]:
     specs = specs_of(source, GoalConfig(tasks=config.tasks))
     return [spec for spec in specs if tasks is None or spec.task in tasks]
 
@@ -186,7 +199,7 @@ def _specs(source: RobotSource, config: EvalConfig, tasks: tuple[str, ...] | Non
 @lru_cache(maxsize=64)
 @show_progress(None)
 def _random_episodes(
-    source: RobotSource, config: EvalConfig, tasks: tuple[str, ...] | None
+    source: Source, config: EvalConfig, tasks: tuple[str, ...] | None
 ) -> list[list[Episode]]:
     """Return the episodes of the random policy by robot; memoised, for all modes of a policy."""
     make, library = partial(Random, config.seed), tuple(map(Path, source.library))
@@ -267,7 +280,7 @@ def eval_config_of(
     return EvalConfig(episodes, sim, seed, workers, config.evaluation_tasks)
 
 
-def zero_shot(source: RobotSource, policy: Path, config: EvalConfig) -> dict[str, Score]:
+def zero_shot(source: OneRobot, policy: Path, config: EvalConfig) -> dict[str, Score]:
     """Run a policy on a robot, and the controllers that do not learn, but for zero actions.
 
     All of them have the same starts and goals. The scores are by name of the controller.
@@ -275,7 +288,7 @@ def zero_shot(source: RobotSource, policy: Path, config: EvalConfig) -> dict[str
     name = name_of(policy)
     require_trained_tasks(read_checkpoint(policy)[0], [source], name)
     scores = {name: evaluate_checkpoints([policy], source, config, "deterministic")[0]}
-    for baseline in baselines_for(str(source.task)):
+    for baseline in baselines_for(source.task):
         if baseline != ZERO.name:
             (scores[baseline],) = evaluate_baseline(baseline, source, config)
     return scores

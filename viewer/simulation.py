@@ -21,7 +21,7 @@ from morphgen.grammar.robot_source import is_robot_file
 from morphgen.rl.baselines import BASELINES, Controller
 from morphgen.rl.inference import ControllerSpec, make_env_and_controller, read_controller
 from morphgen.rl.runs.checkpoint import read_checkpoint
-from morphgen.rl.runs.robot_source import FILE, members, read_drawn
+from morphgen.rl.runs.robot_source import FILE, GrammarSource, OneRobot, members, read_drawn
 from morphgen.rl.shipped_policies import is_named, policies_for
 from morphgen.tasks.gym.env import TaskEnv
 from morphgen.tasks.registry import TASKS
@@ -110,14 +110,15 @@ def training_robots(policy: str, files: FileAccess) -> tuple[str, bool, list[tup
     path = checkpoint_path(policy, BASELINES, files)
     source = read_checkpoint(path)[0].source
     rows = members(source)
-    if source.grammars:
+    if isinstance(source, GrammarSource):
         folder = path if path.is_dir() else path.parent
         rows = read_drawn(folder) if (folder / FILE).is_file() else ()
         if not rows:
-            return str(source.task), source.obstacles, []
+            return source.task, source.obstacles, []
     if rows:
         robots = [(row.name, f"{DERIVATION}{row.derivation}") for row in rows]
         return rows[0].task, any(row.obstacles for row in rows), robots
+    assert isinstance(source, OneRobot)  # splits and grammars have members
     # The name comes from a file, so paths in it are read only through ``files``.
     words = source.name.split()
     if is_robot_file(source.name):
@@ -128,7 +129,6 @@ def training_robots(policy: str, files: FileAccess) -> tuple[str, bool, list[tup
         robot = load_robot(source.name, library=files.library_folders)
     derivation = robot.provenance.get("derivation")
     uri = f"{DERIVATION}{derivation}" if derivation else source.name
-    assert source.task is not None  # only a split has none, and its robots were returned above
     return source.task, source.obstacles, [(source.name, uri)]
 
 

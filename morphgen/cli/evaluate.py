@@ -36,9 +36,12 @@ from morphgen.rl.inference import MODES
 from morphgen.rl.runs.checkpoint import RunConfig, read_checkpoint, read_config
 from morphgen.rl.runs.robot_source import (
     FILE,
-    RobotSource,
+    GrammarSource,
+    Source,
+    SplitSource,
     fresh_source,
     other_side,
+    side_of,
     specs_of,
     split_of,
     tasks_of,
@@ -70,7 +73,7 @@ def rules_of(words: Sequence[str]) -> EvalProtocol:
 
 def plan_submission(
     args: argparse.Namespace,
-    source: RobotSource,
+    source: Source,
     config: EvalConfig,
     **facts: Any,  # noqa: ANN401
 ) -> Callable[[Iterable[Score]], None]:
@@ -80,7 +83,7 @@ def plan_submission(
     """
     if args.submission is None:
         return lambda scores: None
-    if not source.split:
+    if not isinstance(source, SplitSource):
         raise TaskError(f"--submission: {source.name} is no split; name one with --split")
     if args.on == "train":
         raise TaskError("--submission: the test robots are needed; leave --on train out")
@@ -132,13 +135,13 @@ def _baseline_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
     _prepare(sources, config)
     scores: list[Score] = []
     for source in sources:
-        with stage(source.side):
+        with stage(side_of(source)):
             scores += evaluate_baseline(name, source, config)
     write(scores)
     return {name: scores}
 
 
-def _prepare(sources: Sequence[RobotSource], config: EvalConfig) -> None:
+def _prepare(sources: Sequence[Source], config: EvalConfig) -> None:
     """Make the goal sets of robots, and show how many are ready; evaluations find them made."""
     for source in sources:
         specs_of(source, GoalConfig(tasks=config.tasks))
@@ -162,7 +165,7 @@ def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
     require_trained_tasks(run, sources, args.checkpoint)
     tasks = _with_goal(config.tasks, sources, args)
     config = replace(config, sim=_simulator(args) or config.sim, tasks=tasks)
-    sides = _sides(args, has_test=bool(run.source.split))
+    sides = _sides(args, run.source)
     write = plan_submission(
         args,
         sources[0],
@@ -176,12 +179,12 @@ def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
     evaluated = given or [other_side(run.source, side) for side in sides]
     _prepare(evaluated, config)
     results: dict[str, list[Score]] = {}
-    if args.words and run.source.grammars:
+    if args.words and isinstance(run.source, GrammarSource):
         _warn_of_drawn(files[0].parent, sources)
     for mode in (args.mode,) if args.mode else MODES:
         scores = results[mode] = []
         for source in evaluated:
-            with stage(f"{mode} on {source.side}"):
+            with stage(f"{mode} on {side_of(source)}"):
                 scores += evaluate_checkpoints(files, source, config, mode, device=args.device)
     write(chain.from_iterable(results.values()))  # with --submission of one mode
     return results
@@ -189,11 +192,11 @@ def _policy_scores(args: argparse.Namespace) -> dict[str, list[Score]]:
 
 def _given_robots(
     args: argparse.Namespace, run: RunConfig, folder: Path, config: EvalConfig
-) -> list[RobotSource]:
+) -> list[Source]:
     """Return other robots to evaluate than the run's own: named ones, or fresh ones of grammars."""
     if args.words:
         return _sources(args)
-    if not run.source.grammars:
+    if not isinstance(run.source, GrammarSource):
         return []
     if args.on == "train":
         raise TaskError(
@@ -214,7 +217,7 @@ def _simulator(args: argparse.Namespace) -> str | None:
     return None if args.sim is None else str(args.sim)
 
 
-def _warn_of_drawn(folder: Path, sources: list[RobotSource]) -> None:
+def _warn_of_drawn(folder: Path, sources: list[Source]) -> None:
     """Say which of the robots to evaluate were among the drawn robots of a run."""
     if not (folder / FILE).is_file():
         unknown = "it is unknown whether the policy was trained on any of these robots"
@@ -225,19 +228,19 @@ def _warn_of_drawn(folder: Path, sources: list[RobotSource]) -> None:
         note(f"morphgen: the policy was trained on {', '.join(names)}")
 
 
-def _sides(args: argparse.Namespace, *, has_test: bool) -> tuple[Side, ...]:
+def _sides(args: argparse.Namespace, source: Source) -> tuple[Side, ...]:
     if args.on is not None:
         return (args.on,)
-    return ("train", "test") if has_test else ("train",)
+    return ("train", "test") if isinstance(source, SplitSource) else ("train",)
 
 
-def _sources(args: argparse.Namespace) -> list[RobotSource]:
+def _sources(args: argparse.Namespace) -> list[Source]:
     source = robots_to_train(args.words, args)
-    return [other_side(source, side) for side in _sides(args, has_test=bool(source.split))]
+    return [other_side(source, side) for side in _sides(args, source)]
 
 
 def _with_goal(
-    configs: Iterable[TaskConfig], sources: list[RobotSource], args: argparse.Namespace
+    configs: Iterable[TaskConfig], sources: list[Source], args: argparse.Namespace
 ) -> tuple[TaskConfig, ...]:
     """Return configs with the goal of ``--goal``, which must be for a robot of the sources."""
     return opt.with_goal(configs, args.goal, (task for each in sources for task in tasks_of(each)))

@@ -23,7 +23,7 @@ from morphgen.rl.evaluation import EvalConfig, eval_config_of, zero_shot, zero_s
 from morphgen.rl.inference import FPS, Episode, make_env_and_controller, read_controller
 from morphgen.rl.inference import play as run_episodes
 from morphgen.rl.runs.checkpoint import read_checkpoint
-from morphgen.rl.runs.robot_source import RobotSource, robot_source
+from morphgen.rl.runs.robot_source import OneRobot, robot_source
 from morphgen.rl.scores import Score, success_of
 from morphgen.rl.shipped_policies import POLICIES, checkpoint_path, zero_shot_policy
 from morphgen.tasks.reach import GOAL_KINDS
@@ -159,7 +159,7 @@ def _table(scores: Mapping[str, Score], task: str) -> str:
     return tabulate(columns, headers="keys")
 
 
-def _film(source: RobotSource, policy: Path, config: EvalConfig, args: argparse.Namespace) -> None:
+def _film(source: OneRobot, policy: Path, config: EvalConfig, args: argparse.Namespace) -> None:
     env, controller = make_env_and_controller(
         read_controller(str(policy), args.task),
         source.name,

@@ -175,16 +175,18 @@ class TrainingProgress:
 
         A line at its end says how many of its episodes diverged, if any did.
         """
-        from morphgen.rl.runs.robot_source import tasks_of
+        from morphgen.rl.runs.robot_source import SplitSource, tasks_of
 
         raise_if_interrupted()
         self.close()
-        config = subrun.config
-        name = config.source.member or config.source.name
+        config, source = subrun.config, subrun.config.source
+        name = source.name
+        if isinstance(source, SplitSource) and source.member:
+            name = source.member
         counts = Counter[str]()
         self._shown.callback(_print_divergence, name, counts)
         # The score of a step of push is 1 where it succeeds, else 0: its mean says nothing.
-        is_relative = any(TASKS[task].relative_to_random for task in tasks_of(config.source))
+        is_relative = any(TASKS[task].relative_to_random for task in tasks_of(source))
         metric = "score" if is_relative else "reward"
         show = partial(_print_update, name)
         if sys.stderr.isatty():

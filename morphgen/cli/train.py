@@ -45,7 +45,10 @@ from morphgen.rl.evaluation import EvalConfig, episodes_for
 from morphgen.rl.runs import training
 from morphgen.rl.runs.checkpoint import CHECKPOINT, RunConfig, read_checkpoint
 from morphgen.rl.runs.robot_source import (
-    RobotSource,
+    GrammarSource,
+    OneRobot,
+    Source,
+    SplitSource,
     draw,
     drawn_source,
     other_side,
@@ -96,9 +99,8 @@ def agent_spec(args: argparse.Namespace) -> AgentSpec:
 
 def robots_to_train(
     words: list[str], args: argparse.Namespace, side: Side = "train"
-) -> RobotSource:
+) -> SplitSource | OneRobot:
     """Return the robots that a split, or a robot and ``task=NAME``, describe."""
-    seed, library = args.goal_seed or 0, tuple(args.library)
     choices = " or ".join(f"task={name}" for name in TASKS)
     tasks = [word.removeprefix("task=") for word in words if word.startswith("task=")]
     robot = " ".join(word for word in words if not word.startswith("task="))
@@ -107,18 +109,28 @@ def robots_to_train(
             raise TaskError(f"{' '.join(words)}: name a robot and one task, {choices}")
         TASKS[tasks[0]]  # raises if the task is unknown
         return robot_source(
-            robot, tasks[0], obstacles=args.obstacles, goal_seed=seed, library=library
+            robot,
+            tasks[0],
+            obstacles=args.obstacles,
+            goal_seed=args.goal_seed or 0,
+            library=tuple(args.library),
         )
     if len(words) > 1 or "=" in words[0]:
         raise TaskError(f"{' '.join(words)}: a robot needs its task, {choices}")
     if args.obstacles:
         raise TaskError("--obstacles is for one robot; a split says which robots have obstacles")
     try:
-        split, folder = read_split_or_folder(words[0])
+        return split_to_train(words[0], args, side)
     except BenchmarkError as error:
         if Path(words[0]).exists():
             raise
         raise BenchmarkError(f"{error}; a robot needs {choices}") from error
+
+
+def split_to_train(word: str, args: argparse.Namespace, side: Side = "train") -> SplitSource:
+    """Return a side of a split, with the goals that its folder ships."""
+    split, folder = read_split_or_folder(word)
+    seed, library = args.goal_seed or 0, tuple(args.library)
     goal_folder = folder if folder is not None and has_goals(folder) else None
     if goal_folder is not None:
         shipped_seed = read_split_goals(goal_folder).config.seed
@@ -130,7 +142,7 @@ def robots_to_train(
     return split_source(split, side=side, goal_seed=seed, goals=goal_folder, library=library)
 
 
-def robots_to_draw(args: argparse.Namespace) -> RobotSource:
+def robots_to_draw(args: argparse.Namespace) -> GrammarSource:
     """Return the source that ``--robots`` describes; none of its robots is drawn yet."""
     choices = " or ".join(f"task={name}" for name in TASKS)
     words, task = " ".join(args.words), args.words[0].removeprefix("task=")
@@ -157,13 +169,13 @@ def train(args: argparse.Namespace) -> None:
     with status(args, "reading the robots"):
         spec = agent_spec(args)
         if args.robots is None:
-            source = other_side(robots_to_train(args.words, args), args.on)
+            source: Source = other_side(robots_to_train(args.words, args), args.on)
         else:
             source = robots_to_draw(args)
     config = run_config(source, spec, args)  # before robots are drawn, which takes minutes
     _require_used(config, args)
-    if source.grammars:
-        config = _drawn(config, args)
+    if isinstance(source, GrammarSource):
+        config = _drawn(config, source, args)
     # Positions came first and have no suffix.
     name = _folder_name(source) + "-pose" * (args.goal == "pose")
     folder = args.out or Path("runs") / name / str(spec) / f"seed{args.seed}"
@@ -174,7 +186,7 @@ def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> N
     """Train in a folder with a progress bar, and print the paths of the checkpoints."""
     with training_progress("with --resume") as display:
         execution = execution_config(args)
-        if config.source.grammars and not SIMULATORS[config.sim].takes_workers:
+        if isinstance(config.source, GrammarSource) and not SIMULATORS[config.sim].takes_workers:
             execution = replace(execution, workers=1)  # those of --workers have drawn the robots
         subruns = training.train(
             folder, config, resume=args.resume, execution=execution, show=display.training
@@ -194,11 +206,11 @@ def _next_command(folder: Path, config: RunConfig) -> str:
     source = config.source
     # Only the script that registered a task can play it.
     program = "morphgen"
-    if source.task is not None and not TASKS.is_installed(source.task):
+    if not all(map(TASKS.is_installed, tasks_of(source))):
         program = f"python {shlex.quote(sys.argv[0])}"
-    if source.grammars:
+    if isinstance(source, GrammarSource):
         return f"score it on fresh robots: {program} eval {shlex.quote(str(folder))}"
-    if source.task is not None:
+    if isinstance(source, OneRobot):
         words = [source.task, source.name, *["--obstacles"] * source.obstacles]
         words += ["--policy", str(folder), "--sim", config.sim]
         for library in source.library:
@@ -207,7 +219,7 @@ def _next_command(folder: Path, config: RunConfig) -> str:
     return f"score it: {program} eval {shlex.quote(str(folder))}"
 
 
-def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -> RunConfig:
+def run_config(source: Source, spec: AgentSpec, args: argparse.Namespace) -> RunConfig:
     """Return the configuration of a run from the options."""
     preset = preset_of(args.preset, spec.agent)
     changes = {**preset.constants, **parse_constants(args.set)}
@@ -230,50 +242,50 @@ def run_config(source: RobotSource, spec: AgentSpec, args: argparse.Namespace) -
     )
 
 
-def _drawn(config: RunConfig, args: argparse.Namespace) -> RunConfig:
+def _drawn(config: RunConfig, source: GrammarSource, args: argparse.Namespace) -> RunConfig:
     """Draw the robots of a run, after all that can be checked before; return its configuration."""
     if args.slice_updates is not None and num_slices(config) == 1:
         raise TaskError(
-            f"--slice-updates {args.slice_updates}: {config.source.name} has an environment for "
+            f"--slice-updates {args.slice_updates}: {source.name} has an environment for "
             "every robot at all times"
         )
     slice_updates = args.slice_updates or default_slice_updates(config)
     config = replace(config, slice_updates=slice_updates)
     require_runnable(config)
     with training_progress():
-        robots = draw(config.source, GoalConfig(tasks=config.tasks), jobs=args.workers)
+        robots = draw(source, GoalConfig(tasks=config.tasks), jobs=args.workers)
     if robots.skipped:
         reasons = ", ".join(f"{count} {reason}" for reason, count in robots.skipped.items())
         note(f"morphgen: robots that were skipped: {reasons}")
-    held_out = (read_split(name).max_links for name in config.source.held_out)
+    held_out = (read_split(name).max_links for name in source.held_out)
     max_links = args.max_links or default_max_links([robots.most_links, *held_out])
-    source = replace(config.source, drawn_hash=robots.hash)
-    return replace(config, source=source, max_links=max_links)
+    drawn = replace(source, drawn_hash=robots.hash)
+    return replace(config, source=drawn, max_links=max_links)
 
 
-def _max_links(source: RobotSource) -> int:
+def _max_links(source: Source) -> int:
     """Return the number of links that observations are padded to, unless ``--max-links`` is given.
 
     For a split it is the split's number. For drawn robots, of which the largest is not known yet,
     it is the benchmark's. For one robot it is the benchmark's, or the number of the
     robot's links if these are more, as for a robot with two arms.
     """
-    if source.split:
+    if isinstance(source, SplitSource):
         return split_of(source).max_links
-    if source.grammars:
+    if isinstance(source, GrammarSource):
         return default_max_links([])
     robot = load_robot(source.name, library=map(Path, source.library))
     return default_max_links([len(robot.links)])
 
 
-def _task_configs(source: RobotSource, args: argparse.Namespace) -> tuple[TaskConfig, ...]:
+def _task_configs(source: Source, args: argparse.Namespace) -> tuple[TaskConfig, ...]:
     """Return the configurations of the tasks from ``--goal`` and ``--train-goals``."""
     tasks, num_goals = tasks_of(source), args.train_goals
     names = dict.fromkeys((*TASKS.builtin, *tasks))
     configs = opt.with_goal((TASKS[name].config_type() for name in names), args.goal, tasks)
     if num_goals is None:
         return configs
-    if source.goal_dir:
+    if isinstance(source, SplitSource) and source.goal_dir:
         raise TaskError(
             f"--train-goals {num_goals}: {source.goal_dir} ships the goals to train on; name the "
             f"split itself, {source.name}, to have others"
@@ -307,12 +319,11 @@ def execution_config(args: argparse.Namespace) -> ExecutionConfig:
     return ExecutionConfig(args.workers, not args.no_tensorboard, args.wandb, minutes)
 
 
-def _folder_name(source: RobotSource) -> str:
-    name = source.name if source.split else f"{Path(source.name).name}-{source.task}"
-    if source.obstacles:
-        name += "-obstacles"
-    if source.side != "train":
-        name += f"-{source.side}"
+def _folder_name(source: Source) -> str:
+    if isinstance(source, SplitSource):
+        name = source.name + "-test" * (source.side == "test")
+    else:
+        name = f"{Path(source.name).name}-{source.task}" + "-obstacles" * source.obstacles
     return re.sub(r"[^\w./-]+", "-", name).strip("/.")
 
 
@@ -331,10 +342,9 @@ def finetune(args: argparse.Namespace) -> None:
 
 def _finetuning_config(file: Path, args: argparse.Namespace) -> RunConfig:
     initial, _ = read_checkpoint(file)
+    source = other_side(initial.source, args.on)
     if args.words:
         source = robots_to_train(args.words, args, args.on)
-    else:
-        source = other_side(initial.source, args.on)
     changes: dict[str, Any] = parse_constants(args.set)
     if unknown := set(changes) - {field.name for field in fields(PPOConfig)}:
         raise TaskError(f"--set {min(unknown)}: the networks are those of the checkpoint")
@@ -374,14 +384,13 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
     episode_steps = max(config.max_episode_steps for config in default_configs())
     num_episodes = episodes_for(args.eval_steps, episode_steps)
     sim = evaluation_simulator(args.sim or DEFAULT_SIMULATOR)
-    # A study has no such options, which robots_to_train and run_config read.
-    args.obstacles, args.seed = False, 0
+    args.seed = 0  # a study has no such option, which run_config reads
     agents, seeds = parse_agents(args.agents or ",".join(AGENTS)), _seeds(args.seeds)
     finetune = sorted(set(args.finetune))
     cells: list[Cell] = []
     words: dict[str, str] = {}
     for name in dict.fromkeys(chain.from_iterable(map(_splits, args.words))):
-        source = robots_to_train([name], args)
+        source = split_to_train(name, args)
         opt.require_other_name(words, source.name, name)
         sides = tasks_of(source), tasks_of(other_side(source, "test"))
         tasks = opt.with_goal(default_configs(), args.goal, chain(*sides))

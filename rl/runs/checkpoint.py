@@ -28,7 +28,13 @@ from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import PolicyConfig, PPOConfig, differences, policy_from, read_fields
 from morphgen.rl.observation_layout import Layout
 from morphgen.rl.policies import make_networks
-from morphgen.rl.runs.robot_source import RobotSource, identity, most_obstacles, tasks_of
+from morphgen.rl.runs.robot_source import (
+    Source,
+    identity,
+    most_obstacles,
+    source_from,
+    tasks_of,
+)
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.observation import ObservationConfig, observation_config
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS, CollisionGeometry
@@ -293,7 +299,7 @@ def policy_interface(policy: PolicyConfig, *, max_links: int, obstacles: int) ->
 class RunConfig:
     """Configuration of a run; together with the machine it determines the weights."""
 
-    source: RobotSource  # robots and their tasks
+    source: Source  # robots and their tasks
     policy: PolicyConfig  # agent and networks
     ppo: PPOConfig  # hyperparameters of PPO
     seed: int = 0  # seed of weights, actions, minibatches and episodes
@@ -422,9 +428,12 @@ def config_from(data: object) -> RunConfig:
                 f"run: unknown task {shortened(repr(name))}; run the script that registers it, or "
                 "install its package"
             )
-    nested = {name: entries.pop(name) for name in ("source", "policy", "ppo") if name in entries}
+    for name in ("source", "policy", "ppo"):
+        if name not in entries:
+            raise TaskError(f"run: missing key {name!r}")
+    nested = {name: entries.pop(name) for name in ("source", "policy", "ppo")}
     values = read_fields(entries, RunConfig, "run", given=nested)
-    source = RobotSource(**read_fields(nested["source"], RobotSource, "run: source"))
+    source = source_from(nested["source"], "run: source")
     for name in tasks_of(source):  # not of all tasks: some may be newer than the run
         if name not in tasks:
             raise TaskError(f"run: missing key {name!r}")

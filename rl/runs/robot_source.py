@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
@@ -30,6 +30,7 @@ from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_source import is_robot_file
 from morphgen.processes import parallel_map
 from morphgen.progress import own_progress, show_progress
+from morphgen.rl.config import read_fields
 from morphgen.splits.candidates import RobotFactory, SampledRecipe, numbered_name
 from morphgen.splits.candidates import members as factory_members
 from morphgen.splits.split import Member, Side, Split, compose_member, split_id
@@ -45,31 +46,73 @@ from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot, me
 from morphgen.tasks.task import EnvSpec, GoalSet
 
 
-@dataclass(frozen=True)
-class RobotSource:
+@dataclass(frozen=True, kw_only=True)
+class _Robots:
     """Robots with their tasks, described by text alone, so that a run's folder describes them."""
 
     name: str
-    """Name of the split, or words that describe one robot, or the path of its file, or the grammars
-    with the number of robots of each."""
-    split: str = ""  # text of the split's file; empty without a split
-    task: str | None = None
-    """Task of all robots; None for a split, which has a task for each of them."""
-    obstacles: bool = False
-    """Whether the robots are among obstacles; a split says it for each of them."""
-    side: Side = "train"  # side of the split
-    robot_hash: str = ""  # hash of the one robot; empty with a split, which has one for each
-    member: str | None = None  # name of the only member that is meant; None for all of the side
+    """Name of the split; words that describe one robot, or its file; or the grammars with the
+    number of robots of each."""
     goal_seed: int = 0  # seed of goals, starts and obstacles
+    library: tuple[str, ...] = ()  # folders with further parts
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitSource(_Robots):
+    """The robots of a side of a split, each with its own task."""
+
+    split: str  # text of the split's file; empty in a submission, which has its name and id
+    side: Side = "train"
+    member: str | None = None  # name of the only member that is meant; None for all of the side
     goal_dir: str = ""
     """Folder where the split is built with the goal sets to use; without it goals are sampled."""
-    library: tuple[str, ...] = ()  # folders with further parts
-    grammars: tuple[tuple[str, int], ...] = ()
-    """Grammars, by name or path, and the number of robots to draw from each; see ``draw``."""
-    draw_seed: int = 0  # seed of the drawn robots: they are those of `morphgen sample --seed`
+
+
+@dataclass(frozen=True, kw_only=True)
+class OneRobot(_Robots):
+    """One robot at a task."""
+
+    task: str
+    obstacles: bool = False
+    robot_hash: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class GrammarSource(_Robots):
+    """Robots that ``draw`` draws from grammars, all at one task."""
+
+    task: str
+    obstacles: bool = False
+    grammars: tuple[tuple[str, int], ...]
+    """Grammars, by name or path, and the number of robots to draw from each."""
+    draw_seed: int = 0  # seed of the robots: they are those of `morphgen sample --seed`
     held_out: tuple[str, ...] = ()
     """Splits whose test robots are not drawn, besides the splits that morphgen ships."""
     drawn_hash: str = ""  # hash of the drawn robots; empty until they are drawn
+
+
+Source: TypeAlias = SplitSource | OneRobot | GrammarSource
+"""Robots to train or to evaluate on."""
+S = TypeVar("S", bound=Source)
+KINDS = (SplitSource, GrammarSource, OneRobot)
+
+
+def source_from(stored: object, where: str) -> Source:
+    """Return the source that ``dataclasses.asdict`` made a dictionary of.
+
+    Versions until 0.3 wrote the fields of all kinds of sources, empty where they are of another.
+    """
+    data = read_record(stored, dict[str, Any], where, TaskError)
+    kind: type[Source] = OneRobot
+    if data.get("grammars"):
+        kind = GrammarSource
+    elif data.get("task") is None:
+        kind = SplitSource
+    own, known = (
+        {each.name for kind in kinds for each in fields(kind)} for kinds in ([kind], KINDS)
+    )
+    values = {name: value for name, value in data.items() if name in own or name not in known}
+    return kind(**read_fields(values, kind, where))
 
 
 def split_source(
@@ -79,11 +122,11 @@ def split_source(
     goals: Path | None = None,
     library: tuple[Path, ...] = (),
     side: Side = "train",
-) -> RobotSource:
+) -> SplitSource:
     """Return the robots of a side of a split; ``goals`` is the folder with its goal sets."""
-    return RobotSource(
-        split.name,
-        split_text(split),
+    return SplitSource(
+        name=split.name,
+        split=split_text(split),
         side=side,
         goal_seed=goal_seed,
         goal_dir=str(goals.resolve()) if goals is not None else "",
@@ -98,10 +141,10 @@ def robot_source(
     obstacles: bool = False,
     goal_seed: int = 0,
     library: tuple[Path, ...] = (),
-) -> RobotSource:
+) -> OneRobot:
     """Return one robot, named in any way that ``load_robot`` of ``env_specs`` reads."""
-    return RobotSource(
-        str(Path(robot).resolve()) if is_robot_file(robot) else robot,
+    return OneRobot(
+        name=str(Path(robot).resolve()) if is_robot_file(robot) else robot,
         task=task,
         obstacles=obstacles,
         robot_hash=robot_hash(load_robot(robot, library=library)),
@@ -110,14 +153,14 @@ def robot_source(
     )
 
 
-def split_of(source: RobotSource) -> Split:
-    """Return the split of a source that has one."""
+def split_of(source: SplitSource) -> Split:
+    """Return the split of a source."""
     return parse_split(source.split, Path(source.name)).split
 
 
-def members(source: RobotSource) -> tuple[Member, ...]:
-    """Return the members of the split that are meant; none for one robot."""
-    if not source.split:
+def members(source: Source) -> tuple[Member, ...]:
+    """Return the members of the split that are meant; none without a split."""
+    if not isinstance(source, SplitSource) or not source.split:
         return ()
     side = split_of(source).side(source.side)
     if source.member is None:
@@ -131,27 +174,34 @@ def members(source: RobotSource) -> tuple[Member, ...]:
     return tuple(member for member in side if member.name == source.member)
 
 
-def identity(source: RobotSource) -> dict[str, Any]:
+def side_of(source: Source) -> Side:
+    """Return the side of the split; robots without one are train robots."""
+    return source.side if isinstance(source, SplitSource) else "train"
+
+
+def identity(source: Source) -> dict[str, Any]:
     """Return the entries of a source that results depend on: of a split its id, not its text.
 
     The text also has the version of morphgen that wrote it.
     """
-    text = source.split and split_id(split_of(source))
-    return asdict(source) | {"split": text}
+    entries = asdict(source)
+    if isinstance(source, SplitSource) and source.split:
+        entries["split"] = split_id(split_of(source))
+    return entries
 
 
-def tasks_of(source: RobotSource) -> tuple[str, ...]:
+def tasks_of(source: Source) -> tuple[str, ...]:
     """Return the tasks of the robots, without repetition."""
-    if source.task is not None:
-        return (source.task,)
-    return tuple(dict.fromkeys(member.task for member in members(source)))
+    if isinstance(source, SplitSource):
+        return tuple(dict.fromkeys(member.task for member in members(source)))
+    return (source.task,)
 
 
-def other_side(source: RobotSource, side: Side) -> RobotSource:
+def other_side(source: S, side: Side) -> S:
     """Return a whole side of the same split."""
-    if source.split:
+    if isinstance(source, SplitSource):
         return replace(source, side=side, member=None)
-    if side == "test" and source.grammars:
+    if side == "test" and isinstance(source, GrammarSource):
         raise _without_sides(source)
     if side == "test":
         raise TaskError(f"{source.name!r} is one robot and not a split: it has no test robots")
@@ -159,9 +209,9 @@ def other_side(source: RobotSource, side: Side) -> RobotSource:
 
 
 @lru_cache(maxsize=64)
-def most_obstacles(source: RobotSource, config: GoalConfig) -> int:
+def most_obstacles(source: Source, config: GoalConfig) -> int:
     """Return the largest number of obstacles of any robot, on both sides of the split."""
-    if source.task is not None:
+    if not isinstance(source, SplitSource):
         return config.task_config(source.task).obstacles if source.obstacles else 0
     sides: tuple[Side, ...] = ("train", "test")
     both = (member for side in sides for member in members(other_side(source, side)))
@@ -171,23 +221,26 @@ def most_obstacles(source: RobotSource, config: GoalConfig) -> int:
     )
 
 
-def require_links(source: RobotSource, max_links: int) -> None:
+def require_links(source: Source, max_links: int) -> None:
     """Require that a policy can be tested on the other side of a split, or on held-out robots."""
-    side: Side = "test" if source.side == "train" else "train"
-    others = members(other_side(source, side)) if source.split else ()
-    held_out = (member for name in source.held_out for member in read_split(name).test)
+    side: Side = "test" if side_of(source) == "train" else "train"
+    others: Iterable[Member] = ()
+    if isinstance(source, SplitSource):
+        others = members(other_side(source, side))
+    elif isinstance(source, GrammarSource):
+        others = (member for name in source.held_out for member in read_split(name).test)
     library = default_library(tuple(map(Path, source.library)))
-    for member in (*others, *held_out):
+    for member in others:
         links = len(compose_member(member, library).links)
         require_max_links(links, f"{side} robot {member.name!r}", max_links)
 
 
-def specs_of(source: RobotSource, config: GoalConfig) -> list[EnvSpec]:
+def specs_of(source: Source, config: GoalConfig) -> list[EnvSpec]:
     """Return the robots with their tasks and scenes; each is built once per process."""
-    if source.grammars:
+    if isinstance(source, GrammarSource):
         raise _without_sides(source)
     config = replace(config, seed=source.goal_seed)
-    if source.split:
+    if isinstance(source, SplitSource):
         own, meant = replace(source, split="", member=None), members(source)
         specs: list[EnvSpec] = []
         with own_progress() as show:
@@ -196,16 +249,14 @@ def specs_of(source: RobotSource, config: GoalConfig) -> list[EnvSpec]:
                 specs.append(_of_member(member, own, config))
             show(len(specs), len(meant))
         return specs
-    if source.task is None:
-        raise TaskError(f"{source.name!r}: neither a split nor a robot with a task")
     with show_progress(None):
         robot = load_robot(source.name, library=map(Path, source.library))
-    if source.robot_hash not in ("", robot_hash(robot)):
+    if source.robot_hash != robot_hash(robot):
         raise TaskError(f"{source.name}: the robot has changed since the run began")
     return [env_spec(robot, source.task, config, obstacles=source.obstacles)]
 
 
-def _without_sides(source: RobotSource) -> TaskError:
+def _without_sides(source: GrammarSource) -> TaskError:
     return TaskError(
         f"the training robots {source.name} are drawn from grammars and have no test side: name "
         "other robots with --split"
@@ -213,7 +264,7 @@ def _without_sides(source: RobotSource) -> TaskError:
 
 
 @lru_cache(maxsize=64)
-def _of_member(member: Member, source: RobotSource, config: GoalConfig) -> EnvSpec:
+def _of_member(member: Member, source: SplitSource, config: GoalConfig) -> EnvSpec:
     sets = _shipped(source.goal_dir, source.side) if source.goal_dir else None
     shipped = shipped_goal_set(sets, member.name, source.goal_dir)
     library = default_library(tuple(map(Path, source.library)))
@@ -269,7 +320,7 @@ def drawn_source(
     obstacles: bool = False,
     goal_seed: int = 0,
     library: Sequence[Path] = (),
-) -> RobotSource:
+) -> GrammarSource:
     """Return robots of grammars as a source; ``draw`` draws them."""
     folders = tuple(library)
     grammars = [
@@ -287,8 +338,8 @@ def drawn_source(
         raise TaskError(f"--robots {request}: names the grammar {name!r} {times} times")
     for split in held_out:
         read_split(split)  # raises if it is unknown
-    return RobotSource(
-        ",".join(f"{name}:{count}" for name, _, count in grammars),
+    return GrammarSource(
+        name=",".join(f"{name}:{count}" for name, _, count in grammars),
         task=task,
         obstacles=obstacles,
         goal_seed=goal_seed,
@@ -302,12 +353,12 @@ def drawn_source(
     )
 
 
-def num_drawn(source: RobotSource) -> int:
+def num_drawn(source: Source) -> int:
     """Return the number of robots that a source draws from grammars."""
-    return sum(count for _, count in source.grammars)
+    return sum(count for _, count in source.grammars) if isinstance(source, GrammarSource) else 0
 
 
-def draw(source: RobotSource, config: GoalConfig, *, jobs: int = 1) -> DrawnRobots:
+def draw(source: GrammarSource, config: GoalConfig, *, jobs: int = 1) -> DrawnRobots:
     """Return the robots of a source, which are drawn once per process.
 
     Goal sets are kept in the cache, so that an interrupted call continues.
@@ -326,14 +377,14 @@ def draw(source: RobotSource, config: GoalConfig, *, jobs: int = 1) -> DrawnRobo
     return robots
 
 
-_drawn: dict[tuple[RobotSource, GoalConfig], DrawnRobots] = {}
+_drawn: dict[tuple[GrammarSource, GoalConfig], DrawnRobots] = {}
 """The robots drawn last, by source and goals."""
 _MAX_DRAWN = 8  # largest number of sources whose robots are kept
 
 
 def fresh_source(
-    folder: Path, source: RobotSource, config: GoalConfig, seed: int, *, jobs: int = 1
-) -> tuple[RobotSource, str]:
+    folder: Path, source: GrammarSource, config: GoalConfig, seed: int, *, jobs: int = 1
+) -> tuple[SplitSource, str]:
     """Draw robots to evaluate a run of drawn robots on, other ones than it was trained on.
 
     They are the test side of a split; the second result is a line that describes them.
@@ -351,7 +402,7 @@ def fresh_source(
     return replace(test, library=source.library), line
 
 
-def write_drawn(folder: Path, source: RobotSource, robots: DrawnRobots) -> None:
+def write_drawn(folder: Path, source: GrammarSource, robots: DrawnRobots) -> None:
     """Write the list of drawn robots into a run's folder; the same robots give the same bytes."""
     head = {
         "format": FORMAT,
@@ -380,11 +431,12 @@ def read_drawn(folder: Path) -> tuple[Member, ...]:
     return tuple(Member(**msgspec.structs.asdict(robot)) for robot in robots)
 
 
-def trained_on(folder: Path, source: RobotSource) -> list[str]:
+def trained_on(folder: Path, source: Source) -> list[str]:
     """Return the names of a source's robots that are among the drawn robots of a run."""
     hashes = {member.robot_hash for member in read_drawn(folder)}
     robots = {member.name: member.robot_hash for member in members(source)}
-    robots = robots or {source.name: source.robot_hash}
+    if isinstance(source, OneRobot):
+        robots = {source.name: source.robot_hash}
     return [name for name, robot_hash in robots.items() if robot_hash in hashes]
 
 
@@ -401,7 +453,7 @@ def _parse_request(request: str) -> Iterator[tuple[str, int]]:
 
 
 def _draw_all(
-    source: RobotSource, config: GoalConfig, jobs: int, others: frozenset[str] = frozenset()
+    source: GrammarSource, config: GoalConfig, jobs: int, others: frozenset[str] = frozenset()
 ) -> DrawnRobots:
     """Draw the robots of a source, without those of test sides and those with other hashes."""
     library = default_library(tuple(map(Path, source.library)))
@@ -446,14 +498,14 @@ def _draw_all(
 
 
 def _draw_one(
-    source: RobotSource,
+    source: GrammarSource,
     config: GoalConfig,
     factory: RobotFactory,
     held_out: frozenset[str],
     recipe: SampledRecipe,
 ) -> tuple[Member, EnvSpec | None, str, str]:
     """Return a robot with its environments, or the reason for skipping it and its error."""
-    (member,) = factory_members((factory(recipe),), (str(source.task),), source.obstacles)
+    (member,) = factory_members((factory(recipe),), (source.task,), source.obstacles)
     if member.robot_hash in held_out:
         return member, None, HELD_OUT, ""
     try:

@@ -43,7 +43,9 @@ from morphgen.rl.runs.checkpoint import (
     write_checkpoint,
 )
 from morphgen.rl.runs.robot_source import (
-    RobotSource,
+    GrammarSource,
+    Source,
+    SplitSource,
     draw,
     members,
     num_drawn,
@@ -214,9 +216,9 @@ class TrainingBatches:
         self._device = batch_device(config.sim, device or config.device)
         goals = GoalConfig(tasks=config.tasks)
         self._batch: TaskBatch | None = None
-        is_drawn = bool(config.source.grammars)
-        self.drawn = draw(config.source, goals) if is_drawn else None
-        self._specs = self.drawn.specs if self.drawn else specs_of(config.source, goals)
+        source = config.source
+        self.drawn = draw(source, goals) if isinstance(source, GrammarSource) else None
+        self._specs = self.drawn.specs if self.drawn else specs_of(source, goals)
         for spec in self._specs:
             links = len(spec.robot.links)
             require_max_links(links, f"robot {spec.robot.name!r}", config.max_links)
@@ -300,7 +302,7 @@ what the training taught (docs/results.md, "Fine-tuning")."""
 
 
 def finetuning_config(
-    initial: RunConfig, source: RobotSource, checkpoint: str, changes: Mapping[str, Any]
+    initial: RunConfig, source: Source, checkpoint: str, changes: Mapping[str, Any]
 ) -> RunConfig:
     """Return the config of a run that begins with the networks of another run.
 
@@ -361,18 +363,18 @@ def subruns_of(folder: Path, config: RunConfig) -> list[Subrun]:
     A part per robot has a seed of its own, and an equal share of the environments and timesteps,
     rounded up.
     """
-    per_robot = AGENTS[config.policy.agent].per_robot
-    if not per_robot or not config.source.split or config.source.member:
+    per_robot, source = AGENTS[config.policy.agent].per_robot, config.source
+    if not per_robot or not isinstance(source, SplitSource) or source.member:
         return [Subrun(folder, config)]
-    sources = [replace(config.source, member=each.name) for each in members(config.source)]
+    sources = [replace(source, member=each.name) for each in members(source)]
     share = 1 if config.full_budget else len(sources)
     num_envs = -(-config.num_envs // share)
     ppo = replace(config.ppo, total_timesteps=-(-config.ppo.total_timesteps // share))
     parts = []
-    for i, source in enumerate(sources):
+    for i, each in enumerate(sources):
         seed = int(np.random.SeedSequence([config.seed, i]).generate_state(1)[0])
-        part = replace(config, source=source, ppo=ppo, seed=seed, num_envs=num_envs)
-        parts.append(Subrun(folder / ROBOTS / str(source.member), part))
+        part = replace(config, source=each, ppo=ppo, seed=seed, num_envs=num_envs)
+        parts.append(Subrun(folder / ROBOTS / str(each.member), part))
     return parts
 
 
@@ -422,8 +424,8 @@ def train(
                         open_run(folder, config, resume=resume)
                     holds = True
                     open_run(part.folder, part.config, resume=True)
-                    if batches.drawn is not None:
-                        write_drawn(part.folder, part.config.source, batches.drawn)
+                    if batches.drawn and isinstance(config.source, GrammarSource):
+                        write_drawn(part.folder, config.source, batches.drawn)
                 writes = execution if processes.is_first else None
                 if _learn(learner, batches, part, writes, show, stop):
                     break
@@ -435,10 +437,11 @@ def require_runnable(config: RunConfig) -> None:
 
     Drawn robots may have environments one after another; see ``RunConfig.slice_updates``.
     """
-    robots = len(members(config.source)) or num_drawn(config.source)
-    if config.source.grammars and AGENTS[config.policy.agent].per_robot:
+    source = config.source
+    robots = len(members(source)) or num_drawn(source)
+    if isinstance(source, GrammarSource) and AGENTS[config.policy.agent].per_robot:
         raise TaskError(
-            f"--agent {config.policy.agent}: learns one robot; --robots {config.source.name} needs "
+            f"--agent {config.policy.agent}: learns one robot; --robots {source.name} needs "
             "an agent of many"
         )
     if config.num_envs < robots and not config.slice_updates:
@@ -447,7 +450,8 @@ def require_runnable(config: RunConfig) -> None:
         )
     update_timesteps = config.ppo.num_steps * config.num_envs
     if config.ppo.total_timesteps < update_timesteps:
-        share = f", the share of {config.source.member}" if config.source.member else ""
+        member = source.member if isinstance(source, SplitSource) else None
+        share = f", the share of {member}" if member else ""
         raise TaskError(
             f"--steps {config.ppo.total_timesteps} with --envs {config.num_envs}{share}: an update "
             f"takes {update_timesteps:,} transitions ({config.ppo.num_steps} steps of every "

@@ -11,7 +11,7 @@ from helpers.robots import arm
 from helpers.viser_client import PlainClient
 from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import write_bundle
-from morphgen.rl.runs.robot_source import RobotSource
+from morphgen.rl.runs.robot_source import OneRobot
 from morphgen.viewer import simulation
 
 WORD = "tellnobody"
@@ -131,7 +131,7 @@ def test_checkpoint_cannot_name_an_outside_robot(files, folder, secret, monkeypa
     (folder / "runs").mkdir(exist_ok=True)
     (folder / "runs" / "some.pt").touch()
     for name in (f"{secret}/a.urdf", f"{secret}/a.grammar", f"{secret}"):
-        run = SimpleNamespace(source=RobotSource(name, task="reach"))
+        run = SimpleNamespace(source=OneRobot(name=name, task="reach", robot_hash=""))
         monkeypatch.setattr(simulation, "read_checkpoint", lambda path, run=run: (run, None))
         with pytest.raises(MorphgenError, match="outside of the folders") as refused:
             simulation.training_robots("runs/some.pt", files)

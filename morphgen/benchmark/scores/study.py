@@ -45,7 +45,14 @@ from morphgen.rl.runs.checkpoint import (
     require_open,
     require_same_config,
 )
-from morphgen.rl.runs.robot_source import RobotSource, members, other_side, split_of, tasks_of
+from morphgen.rl.runs.robot_source import (
+    SplitSource,
+    members,
+    other_side,
+    side_of,
+    split_of,
+    tasks_of,
+)
 from morphgen.rl.runs.training import (
     ExecutionConfig,
     ShowMetrics,
@@ -70,7 +77,7 @@ class Cell:
     study: Path  # folder of the study, with the table of episodes
     agent: str  # label of the agent, or name of the baseline
     seed: int | None  # seed of the run; None for a baseline
-    source: RobotSource  # robots that the agent is trained on; for a baseline, a side of the split
+    source: SplitSource  # robots that the agent is trained on; for a baseline, a side of the split
     eval_config: EvalConfig  # configuration of the evaluation
     config: RunConfig | None = None  # config of the run; None for a baseline
     finetune: tuple[int, ...] = ()
@@ -107,7 +114,7 @@ class Cell:
         return ("test",) if self.source.side == "test" else ("train", "test")
 
 
-def baseline_cells(folder: Path, source: RobotSource, eval_config: EvalConfig) -> list[Cell]:
+def baseline_cells(folder: Path, source: SplitSource, eval_config: EvalConfig) -> list[Cell]:
     """Return the cells of the baselines for the tasks of a split."""
     tasks = {task for side in ("train", "test") for task in tasks_of(other_side(source, side))}
     eval_config = replace(eval_config, workers=1)  # scores do not depend on it
@@ -127,6 +134,7 @@ def agent_cell(
 ) -> Cell:
     """Return the cell of a run."""
     source, eval_config = config.source, replace(eval_config, workers=1)
+    assert isinstance(source, SplitSource)  # a study has splits alone
     if AGENTS[config.policy.agent].per_robot or source.side == "test":
         finetune = ()
     return Cell(folder, agent, config.seed, source, eval_config, config, tuple(finetune))
@@ -138,7 +146,7 @@ def matched_budget(config: RunConfig) -> RunConfig:
     The budget is the number of environments and timesteps. Runs on train robots do not change, nor
     do runs with ``full_budget``.
     """
-    if config.source.side == "train" or config.full_budget:
+    if side_of(config.source) == "train" or config.full_budget:
         return config
     num_test = len(members(config.source))
     num_train = len(members(other_side(config.source, "train")))
@@ -181,6 +189,7 @@ def _rules(cell: Cell, split: Split) -> dict[str, Any]:
 
 def _without_split(config: RunConfig) -> RunConfig:
     """Return a config without the text of its split, of which a submission has name and id."""
+    assert isinstance(config.source, SplitSource)
     return replace(config, source=replace(config.source, split=""))
 
 
