@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import scipy  # loads its packages at their first use, which take seconds
 from msgspec import Meta
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import binomtest, bootstrap, trim_mean
 from tabulate import tabulate
 
 from morphgen.errors import BenchmarkError, TaskError, nearest
@@ -90,7 +90,7 @@ def success_interval(rates: ArrayLike, trials: ArrayLike) -> Interval:
     mean = float(rates.mean())
     # As many trials as have the variance of the mean of the strata: all, if they are equally large.
     total = round(rates.size**2 / float(np.sum(1 / trials)))
-    result = binomtest(round(mean * total), total).proportion_ci(LEVEL, method="wilson")
+    result = scipy.stats.binomtest(round(mean * total), total).proportion_ci(LEVEL, method="wilson")
     return Interval(mean, float(result.low), float(result.high))
 
 
@@ -114,12 +114,14 @@ def iqm_interval(scores: ArrayLike, *, together: bool) -> Interval:
     Robots are the strata: every resample has as many scores of each robot as the original.
     """
     table = np.asarray(scores, dtype=np.float64)
-    iqm = float(trim_mean(table.ravel(), TRIM))
+    iqm = float(scipy.stats.trim_mean(table.ravel(), TRIM))
     if len(table) < 2:
         return Interval(iqm, math.nan, math.nan)
 
     def statistic(*strata: NDArray[Any], axis: int = -1) -> NDArray[Any]:
-        values: NDArray[Any] = trim_mean(np.concatenate(strata, axis=axis), TRIM, axis=axis)
+        values: NDArray[Any] = scipy.stats.trim_mean(
+            np.concatenate(strata, axis=axis), TRIM, axis=axis
+        )
         return values
 
     return _interval(iqm, tuple(table.T), statistic, paired=together)
@@ -135,7 +137,7 @@ def _interval(
     if all(np.ptp(sample) == 0 for sample in samples):
         return Interval(value, math.nan, math.nan)
     num_values = sum(len(sample) for sample in samples)
-    interval = bootstrap(
+    interval = scipy.stats.bootstrap(
         samples,
         statistic,
         paired=paired,

@@ -14,8 +14,8 @@ from fnmatch import fnmatchcase
 from functools import cached_property
 
 import numpy as np
+import scipy  # loads its packages at their first use, which take seconds
 from numpy.typing import ArrayLike
-from scipy.optimize import linprog
 
 from morphgen.errors import BenchmarkError, CompositionError, nearest
 from morphgen.grammar.derivation import Derivation, parse_derivation
@@ -178,7 +178,7 @@ def hull_distance(point: ArrayLike, points: ArrayLike) -> float:
     # coordinate, whose sum is minimised.
     equal = np.block([[scaled.T, np.eye(d), -np.eye(d)], [np.ones((1, n)), np.zeros((1, 2 * d))]])
     cost = np.concatenate([np.zeros(n), np.ones(2 * d)])
-    solution = linprog(cost, A_eq=equal, b_eq=np.append(target, 1.0), method="highs")
+    solution = scipy.optimize.linprog(cost, A_eq=equal, b_eq=np.append(target, 1.0), method="highs")
     if not solution.success:
         raise BenchmarkError(f"the convex hull of {n} robots: {solution.message}")
     return max(float(solution.fun), 0.0)

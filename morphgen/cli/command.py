@@ -194,7 +194,7 @@ def _type(name: str) -> Callable[[str], object] | None:
     least, dots, largest = name.partition("..")
     if dots:
         return whole_number(int(least), int(largest) if largest else None)
-    types = {"str": None, "path": Path, "float": float, "int": int}
+    types = {"str": None, "path": Path, "float": float, "int": int, "policy": policy}
     return {**types, "positive": positive, "names": _names_of, "numbers": _numbers_of}[name]
 
 
@@ -259,6 +259,16 @@ def whole_number(least: int, largest: int | None = None) -> Callable[[str], int]
         return int(number)
 
     return parse
+
+
+def policy(text: str) -> str:
+    """Read the name of a baseline or shipped policy, or an existing path; a type for argparse."""
+    names = (*BASELINES, *POLICIES)
+    if text not in names and not Path(text).exists():
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is neither a checkpoint nor a policy{nearest(text, names)}"
+        )
+    return text
 
 
 def positive(text: str) -> float:

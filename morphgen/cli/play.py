@@ -17,15 +17,13 @@ from tabulate import tabulate
 
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, print_line, status
-from morphgen.errors import TaskError
-from morphgen.rl.baselines import BASELINES
 from morphgen.rl.evaluation import EvalConfig, eval_config_of, zero_shot, zero_shot_data
 from morphgen.rl.inference import FPS, Episode, make_env_and_controller, read_controller
 from morphgen.rl.inference import play as run_episodes
 from morphgen.rl.runs.checkpoint import read_checkpoint
 from morphgen.rl.runs.robot_source import OneRobot, robot_source
 from morphgen.rl.scores import Score, success_of
-from morphgen.rl.shipped_policies import POLICIES, checkpoint_path, zero_shot_policy
+from morphgen.rl.shipped_policies import checkpoint_path, zero_shot_policy
 from morphgen.tasks.reach import GOAL_KINDS
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.render.renderer import require_video_path, write_video
@@ -37,11 +35,6 @@ from morphgen.tasks.speed import measure_speed
 
 def play(args: argparse.Namespace) -> None:
     """Run the episodes, print a line for each, and write the video."""
-    names = (*BASELINES, *POLICIES)
-    if args.policy not in names and not Path(args.policy).exists():
-        raise TaskError(
-            f"unknown policy {args.policy!r}: expected one of {', '.join(names)}, or a path"
-        )
     spec = read_controller(args.policy, args.task)
     if args.out is not None:
         require_video_path(args.out)

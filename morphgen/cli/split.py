@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,14 +11,13 @@ from typing import Any, cast
 
 from tabulate import tabulate
 
-from morphgen.api.splits import NewSplit
+from morphgen.api.splits import DEFAULT_TRAIN, NewSplit
 from morphgen.api.splits import split as choose
 from morphgen.benchmark import release as releases
 from morphgen.benchmark.audit import Audit, audit_goals, goals_to_audit, with_goal_findings
 from morphgen.benchmark.audit import audit as audit_robots
 from morphgen.benchmark.hold_out import related_parts
 from morphgen.benchmark.licences import (
-    licence_lines,
     licenced_parts,
     restricted,
     restriction_line,
@@ -47,7 +44,7 @@ from morphgen.formats.files import require_writable_file, write_file
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding
 from morphgen.rl.baselines import BASELINES
-from morphgen.splits.split import HOLD_OUT, SIDES, Member, Split, split_id
+from morphgen.splits.split import HOLD_OUT, SIDES, Split, split_id
 from morphgen.splits.split_file import read_split, split_names, split_paths, write_new_splits
 from morphgen.tasks.goals.split_goals import (
     GoalResult,
@@ -314,90 +311,6 @@ def _difficulty_text(
     return "\n".join(["\n\n".join(parts), "", *notes, *files])
 
 
-SHORT_DERIVATION = 60
-"""Number of characters of a derivation that ``show`` prints without ``--full``."""
-
-
-def list_splits(args: argparse.Namespace) -> None:
-    """Print a row per split."""
-    splits = [read_split(name) for name in split_names()]
-    data: list[dict[str, Any]] = [
-        {
-            "name": split.name,
-            "regime": split.regime,
-            "tasks": _tasks(split),
-            "train": len(split.train),
-            "test": len(split.test),
-            "train_categories": _categories(split.train),
-            "test_categories": _categories(split.test),
-            "summary": split.summary,
-            "reference": split.reference,
-        }
-        for split in splits
-    ]
-    headers = ("name", "regime", "task", "train", "test", "categories", "summary")
-    rows = [
-        (
-            *(row["name"], row["regime"], ", ".join(row["tasks"]), row["train"], row["test"]),
-            f"{', '.join(row['train_categories'])} -> {', '.join(row['test_categories'])}",
-            row["summary"],
-        )
-        for row in data
-    ]
-    opt.print_result(args, data, lambda: tabulate(rows, headers))
-
-
-def show(args: argparse.Namespace) -> None:
-    """Print a split."""
-    split = read_split(args.split)
-    try:
-        parts = licenced_parts(split, opt.library_of(args))
-        licences, lines = [part.as_dict() for part in parts], licence_lines(parts)
-    except PartError as error:
-        licences, lines = None, [f"licences: {error}; see --library"]
-    data = {"id": split_id(split), **split.as_dict(), "licences": licences}
-    opt.print_result(args, data, lambda: _split_text(split, lines, full=args.full))
-
-
-def _split_text(split: Split, licences: Sequence[str], *, full: bool) -> str:
-    lines = [f"{split.name} ({split.regime}): {split.summary}", f"  id: {split_id(split)}"]
-    if split.reference:
-        lines.append(f"  reference: {split.reference}")
-    for key, value in split.provenance.items():
-        if full or isinstance(value, int | str):
-            text = value if isinstance(value, str) else json.dumps(value).replace('"', "")
-            lines.append(f"  {key}: {text}")
-    lines += [f"  {line}" for line in licences]
-    lines += [f"  accepted {code}: {reason}" for code, reason in split.accepted.items()]
-    headers = ("name", "task", "category", "body", "derivation")
-    for side in SIDES:
-        members = split.side(side)
-        counts = ", ".join(f"{n} {name}" for name, n in _categories(members).items())
-        rows = [_row(member, full=full) for member in members]
-        lines.append(f"\n{side}, {len(members)}: {counts}")
-        lines.append(tabulate(rows, headers, disable_numparse=True))
-    return "\n".join(lines)
-
-
-def _row(member: Member, *, full: bool) -> tuple[str, ...]:
-    text = member.derivation
-    if not full and len(text) > SHORT_DERIVATION:
-        text = f"{text[: SHORT_DERIVATION - 3]}..."
-    return (member.name, _task(member), member.category, member.robot_hash[:8], text)
-
-
-def _task(member: Member) -> str:
-    return member.task + (" (obstacles)" if member.obstacles else "")
-
-
-def _tasks(split: Split) -> list[str]:
-    return sorted({_task(member) for member in (*split.train, *split.test)})
-
-
-def _categories(members: Sequence[Member]) -> Counter[str]:
-    return Counter(member.category for member in members)
-
-
 def stats(args: argparse.Namespace) -> None:
     """Print a table with a row per set of robots."""
     library = opt.library_of(args)
@@ -480,12 +393,15 @@ def new(args: argparse.Namespace) -> None:
     """Choose the robots, write the splits and print what they are."""
     if args.subcommand is None and not args.hold_out:
         args.parser.error("the following arguments are required: --hold-out, or COMMAND")
-    # Smaller splits are parts of the largest.
-    total = args.train[-1] + args.test if args.train else None
     choice = opt.given(args, NewSplit.__annotations__)
     choice["regime"] = args.subcommand or HOLD_OUT
+    train = args.train
+    if train is None:
+        train = () if choice["regime"] == "composition" else (DEFAULT_TRAIN,)
+    # Smaller splits are parts of the largest.
+    total = train[-1] + args.test if train else None
     with bar(args, "sampling", total=total):
-        loaded = choose(args.name or "", train=args.train, library=args.library, **choice)
+        loaded = choose(args.name or "", train=train, library=args.library, **choice)
     splits = [each.definition for each in loaded]
     paths = split_paths(args.out, splits)
     write_new_splits(splits, paths)

@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # loads its packages at their first use, which take seconds
 
 from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape, Sphere
 from morphgen.model.rotation import IDENTITY, Quat, normalize
@@ -64,7 +64,7 @@ def least_rotation(kind: Kind, R: Array) -> Quat:
         rotations = R @ _BOX_SYMMETRIES
         # The trace of a rotation is 1 + 2 cos(angle).
         traces = np.trace(rotations, axis1=1, axis2=2).round(_DECIMALS)
-        best = Rotation.from_matrix(rotations[np.argmax(traces)])
+        best = scipy.spatial.transform.Rotation.from_matrix(rotations[np.argmax(traces)])
         w, x, y, z = best.as_quat(scalar_first=True).tolist()
         return normalize((w, x, y, z))
     x, y, z = R[:, 2].tolist()

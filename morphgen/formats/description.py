@@ -10,7 +10,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from morphgen.errors import FormatError, nearest
-from morphgen.formats.mjcf.read import read_mjcf
 from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.urdf.read import read_urdf, require_description_file
 from morphgen.formats.xml import root_tag
@@ -31,6 +30,8 @@ def read_description(
     """Read a xacro (by its suffix), an MJCF (by its root element ``<mujoco>``), or a URDF."""
     require_description_file(path)
     if is_mjcf(path):
+        from morphgen.formats.mjcf.read import read_mjcf  # takes a second to load
+
         if args:
             raise FormatError(
                 f"{path}: xacro arguments {', '.join(args)} for a file that is not a xacro"

@@ -99,6 +99,19 @@ def test_a_second_signal_does_not_stop_the_cleaning_up(number, run, tmp_path, mo
     assert tree(tmp_path) == before
 
 
+def test_ctrl_c_within_an_exec_gives_the_exit_code(tmp_path):
+    (tmp_path / "stopped.py").write_text(
+        """
+import os, signal
+from morphgen import cli
+cli._run = lambda *_: exec("os.kill(os.getpid(), signal.SIGINT); [0 for _ in range(9)]")
+raise SystemExit(cli.main([]))
+"""
+    )
+    ended = subprocess.run([sys.executable, "-m", "stopped"], stderr=subprocess.PIPE, check=False)
+    assert (ended.returncode, ended.stderr[:22]) == (130, b"morphgen: interrupted;")
+
+
 def test_an_ignored_signal_stays_ignored(run, monkeypatch):
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as by nohup
     chmod = Path.chmod
