@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt as interrupt:
             text = str(interrupt) or "nothing half-written is left"
             print(f"morphgen: interrupted; {text}", file=sys.stderr)
-            # Else `python -m morphgen` ends by the signal if it interrupted an exec, as of a dataclass.
+            # Else python -m ends by the signal if it interrupted an exec, as that of a dataclass.
             exec("")
             return 128 + (received or [signal.SIGINT])[0]  # as a shell reports a signal
         finally:
