@@ -174,13 +174,7 @@ def file_findings(folder: Path) -> tuple[Finding, ...]:
     return tuple(findings)
 
 
-def read_robot(
-    path: Path,
-    args: dict[str, str] | None = None,
-    *,
-    root: Path | None = None,
-    skip_missing_meshes: bool = False,
-) -> Robot:
+def read_robot(path: Path, *, root: Path | None = None, skip_missing_meshes: bool = False) -> Robot:
     """Read a bundle's folder, a URDF, a xacro or an MJCF.
 
     The URDF or MJCF of a bundle stands for the bundle. Another description gets the fits of a
@@ -194,7 +188,7 @@ def read_robot(
         return read_bundle(path.parent, root=root)
     is_xacro = path.suffix == XACRO
     finder = default_finder(root=root, skip_missing=skip_missing_meshes)
-    robot = read_description(path, args, finder, written_frames=not is_xacro)
+    robot = read_description(path, finder=finder, written_frames=not is_xacro)
     return replace(robot, fits=fits_in(path.parent))
 
 

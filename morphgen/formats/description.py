@@ -11,7 +11,7 @@ from pathlib import Path
 
 from morphgen.errors import FormatError, nearest
 from morphgen.formats.resolve import PackageFinder
-from morphgen.formats.urdf.read import read_urdf, require_description_file
+from morphgen.formats.urdf.read import read_urdf, require_description_file, require_no_arguments
 from morphgen.formats.xml import root_tag
 from morphgen.model.robot import Robot
 
@@ -32,10 +32,7 @@ def read_description(
     if is_mjcf(path):
         from morphgen.formats.mjcf.read import read_mjcf  # takes a second to load
 
-        if args:
-            raise FormatError(
-                f"{path}: xacro arguments {', '.join(args)} for a file that is not a xacro"
-            )
+        require_no_arguments(path, args)
         return read_mjcf(path, finder, root_body=root_link)
     return read_urdf(path, args, finder, written_frames=written_frames)
 

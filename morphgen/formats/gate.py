@@ -9,26 +9,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from lxml import etree
 
 from morphgen.formats.bundle import MJCF, URDF, mesh_file
-from morphgen.formats.data_files import read_bytes
 from morphgen.formats.description import is_mjcf
 from morphgen.formats.mjcf.compile import compile_document
 from morphgen.formats.mjcf.document import read_document, remove_element
 from morphgen.formats.resolve import PackageFinder, default_finder, resolve_uri
 from morphgen.formats.urdf.read import (
-    MAX_URDF_BYTES,
     require_description_file,
     resolved_meshes,
     robot_from_xml,
+    urdf_bytes,
 )
 from morphgen.formats.urdf.schema import CHILDREN
-from morphgen.formats.xacro.expand import expand
 from morphgen.formats.xml import parse_description
 from morphgen.model.geometry import Mesh
 from morphgen.model.mesh import require_bounded_meshes
@@ -45,9 +42,7 @@ _FILE_ATTRIBUTES = ("assetdir", "meshdir", "strippath", "texturedir")
 
 
 @contextmanager
-def loader_copy(
-    path: Path, finder: PackageFinder | None = None, args: Mapping[str, str] | None = None
-) -> Iterator[Path]:
+def loader_copy(path: Path, finder: PackageFinder | None = None) -> Iterator[Path]:
     """Yield a private folder with a copy of a robot that other libraries may open.
 
     Yields:
@@ -63,8 +58,8 @@ def loader_copy(
             if is_mjcf(path):
                 _copy_mjcf(path, folder, finder)
             else:
-                _copy_urdf(path, folder, finder, args or {})
-        for file, copy in ((URDF, partial(_copy_urdf, args={})), (MJCF, _copy_mjcf)):
+                _copy_urdf(path, folder, finder)
+        for file, copy in ((URDF, _copy_urdf), (MJCF, _copy_mjcf)):
             # Each loader says itself that its file is missing.
             if path.is_dir() and (path / file).exists():
                 copy(resolve_uri(file, path / URDF, finder), folder, finder)
@@ -82,11 +77,8 @@ def _copy_mjcf(path: Path, folder: Path, finder: PackageFinder) -> None:
     (folder / MJCF).write_bytes(etree.tostring(root, encoding="utf-8"))
 
 
-def _copy_urdf(path: Path, folder: Path, finder: PackageFinder, args: Mapping[str, str]) -> None:
-    if path.suffix == ".xacro":
-        data = expand(path, args, finder)
-    else:
-        data = read_bytes(path, MAX_URDF_BYTES)
+def _copy_urdf(path: Path, folder: Path, finder: PackageFinder) -> None:
+    data = urdf_bytes(path, {}, finder)
     require_bounded_meshes(robot_from_xml(data, path, finder))
     root, _ = parse_description(data, str(path))
     meshes = resolved_meshes(root, path, finder).files

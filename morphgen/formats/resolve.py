@@ -6,7 +6,7 @@ import difflib
 import importlib.metadata
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -44,8 +44,6 @@ class PackageFinder:
 
     roots: tuple[Path, ...] = ()
     """Folders that contain packages, in search order."""
-    packages: tuple[tuple[str, Path], ...] = ()
-    """Name and folder of known packages."""
     root: Path | None = None
     """A folder from which files may be read, besides the description's own folder and package."""
     skip_missing: bool = False
@@ -54,13 +52,13 @@ class PackageFinder:
     def find(self, package: str, *files: Path) -> Path:
         """Return the folder of a package.
 
-        The search order is: the folder in ``packages``; for each of ``files``, from the file
-        upwards, a folder that is the package (by its ``package.xml`` or its name) or contains it
-        directly, above the file's tree (see ``find_file``) only with a ``package.xml`` or ROS's
-        suffix; in each root, a folder of that name or, up to two levels down, one whose
-        ``package.xml`` has that name. Descriptions are often copied into a folder without ROS's
-        suffix, so ``x_description`` and ``x_support`` are then searched as ``x``. Names are
-        case-sensitive, and the root of the file system is not searched.
+        The search order is: for each of ``files``, from the file upwards, a folder that is the
+        package (by its ``package.xml`` or its name) or contains it directly, above the file's tree
+        (see ``find_file``) only with a ``package.xml`` or ROS's suffix; in each root, a folder of
+        that name or, up to two levels down, one whose ``package.xml`` has that name. Descriptions
+        are often copied into a folder without ROS's suffix, so ``x_description`` and ``x_support``
+        are then searched as ``x``. Names are case-sensitive, and the root of the file system is not
+        searched.
         """
         prefix = f"{files[0]}: " if files else ""
         if not _PACKAGE_NAME.match(package):
@@ -82,9 +80,6 @@ class PackageFinder:
         Each comes with whether it is an installed package or one of ROS's environment, which the
         user did not name.
         """
-        for name, folder in self.packages:
-            if name == package:
-                yield _absolute(folder), False
         stems = dict.fromkeys([package, _PACKAGE_SUFFIX.sub("", package)])
         for name in stems:
             yield from ((folder, False) for folder in self._around(name, files))
@@ -117,29 +112,20 @@ class PackageFinder:
                 yield manifest.parent
 
 
-def default_finder(
-    roots: Iterable[Path] = (),
-    packages: Mapping[str, Path] | None = None,
-    root: Path | None = None,
-    *,
-    skip_missing: bool = False,
-) -> PackageFinder:
-    """Return a finder for the given roots, then ROS's environment, then the pip data packages.
+def default_finder(*, root: Path | None = None, skip_missing: bool = False) -> PackageFinder:
+    """Return a finder for ``root``, then ROS's present environment, then the pip data packages.
 
+    root: A folder from which files may be read, besides the description's own folder and package.
     skip_missing: Whether shapes of a URDF whose mesh is not found are left out.
-
-    Returns:
-        A finder with the present values of ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``.
     """
     if root is not None:
         if not root.is_dir():
             raise FormatError(f"root {root}: no such folder")
         root = _absolute(root)
-        roots = (root, *roots)
+    roots = () if root is None else (root,)
     shares = (prefix / "share" for prefix in _path_list("AMENT_PREFIX_PATH"))
     folders = map(_absolute, (*roots, *_path_list("ROS_PACKAGE_PATH"), *shares, *_data_roots()))
-    named = sorted((name, _absolute(folder)) for name, folder in (packages or {}).items())
-    return PackageFinder(tuple(dict.fromkeys(folders)), tuple(named), root, skip_missing)
+    return PackageFinder(tuple(dict.fromkeys(folders)), root, skip_missing)
 
 
 @dataclass(frozen=True)
@@ -276,7 +262,7 @@ def require_allowed_text(path: Path, finder: PackageFinder, *files: Path) -> Non
     ``package.xml``, the finder's folders and its root. Symbolic links are resolved first.
     """
     real = path.resolve()
-    if _is_in(real, (*finder.roots, *(folder for _, folder in finder.packages), finder.root)):
+    if _is_in(real, (*finder.roots, finder.root)):
         return
     trees = [_tree(path, for_text=True) for file in files for path in (file, file.resolve())]
     packaged = any(map(_is_package, _ancestors(real)))
@@ -359,8 +345,7 @@ def _is_in(path: Path, folders: Iterable[Path | None]) -> bool:
 
 def _is_in_package(path: Path, finder: PackageFinder) -> bool:
     """Return whether an absolute path is in one of the finder's folders or in a ROS package."""
-    known = (*finder.roots, *(folder for _, folder in finder.packages))
-    return _is_in(path, known) or any(
+    return _is_in(path, finder.roots) or any(
         _has_suffix(folder) or _is_package(folder) for folder in path.parents
     )
 

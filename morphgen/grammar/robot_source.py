@@ -127,9 +127,9 @@ def robot_list(robots: RobotLike | Iterable[RobotLike]) -> list[RobotLike]:
     return list(robots)
 
 
-def resolve_robot(robot: RobotLike, library: Library, root: Path | None = None) -> Robot:
+def resolve_robot(robot: RobotLike, library: Library) -> Robot:
     """Return a robot, given itself or by its name; see ``find_robot`` and ``read_source``."""
-    return robot if isinstance(robot, Robot) else read_source(find_robot(robot), library, root)
+    return robot if isinstance(robot, Robot) else read_source(find_robot(robot), library)
 
 
 def light_derivation(folder: Path) -> Derivation | None:

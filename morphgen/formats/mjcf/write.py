@@ -35,7 +35,7 @@ class Meshes:
     the triangles themselves (``add_to``).
     """
 
-    def __init__(self, mesh_file: MeshFile | None) -> None:
+    def __init__(self, mesh_file: MeshFile | None = None) -> None:
         self._mesh_file = mesh_file
         self._names: dict[tuple[Mesh, bool], str] = {}
         self._files: dict[str, str] = {}
@@ -57,9 +57,7 @@ class Meshes:
             etree.SubElement(asset, "mesh", name=name, vertex=vertex)
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
-        """Add the triangles of the meshes to a model, if they are not in files."""
-        if self._mesh_file is not None:
-            return
+        """Add the triangles of the meshes to a model."""
         for (mesh, collision), name in self._names.items():
             if name in self._vertices:
                 continue
@@ -186,13 +184,12 @@ def mjcf_text(robot: Robot, mesh_file: MeshFile) -> str:
     return etree.tostring(root, encoding="unicode") + "\n"
 
 
-def to_spec(robot: Robot, mesh_file: MeshFile | None = None) -> mujoco.MjSpec:
+def to_spec(robot: Robot) -> mujoco.MjSpec:
     """Build an editable MuJoCo model, equal to what ``mjcf_text`` writes.
 
-    mesh_file: As for ``mjcf_text``; None puts the triangles into the model, for collision
-        shapes those of the convex hull.
+    It has the triangles of the meshes, for collision shapes those of the convex hull.
     """
-    meshes = Meshes(mesh_file)
+    meshes = Meshes()
     spec = mujoco.MjSpec.from_string(etree.tostring(_document(robot, meshes), encoding="unicode"))
     meshes.add_to(spec)
     return spec

@@ -82,15 +82,24 @@ def read_urdf(
     """
     require_description_file(path)
     finder = finder or default_finder()
+    data = urdf_bytes(path, args or {}, finder)
+    return robot_from_xml(data, path, finder, keep_order=keep_order, written_frames=written_frames)
+
+
+def urdf_bytes(path: Path, args: Mapping[str, str], finder: PackageFinder) -> bytes:
+    """Return the content of a URDF, or of a xacro (by its suffix) when expanded."""
     if path.suffix == ".xacro":
-        data = expand(path, args or {}, finder)
-    elif args:
+        return expand(path, args, finder)
+    require_no_arguments(path, args)
+    return read_bytes(path, MAX_URDF_BYTES)
+
+
+def require_no_arguments(path: Path, args: Mapping[str, str] | None) -> None:
+    """Require that there are no xacro arguments for a file that is not a xacro."""
+    if args:
         raise FormatError(
             f"{path}: xacro arguments {', '.join(args)} for a file that is not a xacro"
         )
-    else:
-        data = read_bytes(path, MAX_URDF_BYTES)
-    return robot_from_xml(data, path, finder, keep_order=keep_order, written_frames=written_frames)
 
 
 def require_description_file(path: Path) -> None:

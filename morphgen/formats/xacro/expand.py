@@ -294,7 +294,6 @@ def run_in_child(
         "task": [task.__module__, task.__name__],
         "path": str(path),
         "roots": [str(root) for root in finder.roots],
-        "packages": [[name, str(folder)] for name, folder in finder.packages],
         "root": None if finder.root is None else str(finder.root),
         "values": {name: dict(given) for name, given in values.items()},
         "limits": {"cpu": CPU_LIMIT, "memory": MEMORY_LIMIT},
@@ -337,7 +336,6 @@ def serve(request: Mapping[str, Any]) -> None:
     """Run the parent's task in this process, the child, and print its result as JSON."""
     finder = PackageFinder(
         tuple(map(Path, request["roots"])),
-        tuple((name, Path(folder)) for name, folder in request["packages"]),
         None if request["root"] is None else Path(request["root"]),
     )
     module, name = request["task"]
