@@ -282,7 +282,10 @@ def holds(condition: Expression, properties: RobotProperties) -> bool:
         case "not":
             return not holds(condition.operands[0], properties)
         case sign:
-            left, right = (_value(operand, properties) for operand in condition.operands)
+            used = (term.text for term in condition.walk() if term.operator == "name")
+            names = {name: (float(getattr(properties, name)), PROPERTIES[name]) for name in used}
+            scope = Scope(names, typical_value, "")
+            left, right = (evaluate(operand, scope)[0] for operand in condition.operands)
             return _COMPARATORS[sign](left, right)
 
 
@@ -302,26 +305,12 @@ def require_condition(expression: Expression) -> None:
         return
     if expression.operator not in _COMPARATORS:
         raise _error(expression, "is a value; a condition compares, such as mass < 40")
-    for name in _names(expression):
-        if name.text not in PROPERTIES:
-            raise unknown("property", name.text, name.location, PROPERTIES)
+    for term in expression.walk():
+        if term.operator == "call":
+            raise GrammarError(f"{term.location}: a condition cannot draw values: {term}")
+        if term.operator == "name" and term.text not in PROPERTIES:
+            raise unknown("property", term.text, term.location, PROPERTIES)
     sample = Scope({name: (1.0, unit) for name, unit in PROPERTIES.items()}, typical_value, "")
     units = {evaluate(operand, sample)[1] for operand in expression.operands}
     if len(units - {""}) > 1:
         raise _error(expression, f"compares {' with '.join(sorted(units))}")
-
-
-def _value(expression: Expression, properties: RobotProperties) -> float:
-    names = {
-        name.text: (float(getattr(properties, name.text)), PROPERTIES[name.text])
-        for name in _names(expression)
-    }
-    return evaluate(expression, Scope(names, typical_value, ""))[0]
-
-
-def _names(expression: Expression) -> Iterator[Expression]:
-    for term in expression.walk():
-        if term.operator == "call":
-            raise GrammarError(f"{term.location}: a condition cannot draw values: {term}")
-        if term.operator == "name":
-            yield term
