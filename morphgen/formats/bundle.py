@@ -20,9 +20,9 @@ from morphgen.formats.data_files import read_json
 from morphgen.formats.description import read_description
 from morphgen.formats.files import (
     file_sha256,
-    first_edit,
     folder_hashes,
     replacing_folder,
+    require_unedited,
     require_writable_folder,
 )
 from morphgen.formats.fits import FITS, find_fit, fits_text, read_fits, shapes_key
@@ -76,13 +76,7 @@ def require_replaceable(folder: Path) -> None:
         return
     if not (folder / CARD).is_file():
         raise FormatError(f"{folder} exists and is not a bundle (no {CARD}); choose another name")
-    if edit := first_edit(folder, _card_hashes(folder), _REPLACED):
-        name, is_changed = edit
-        why = "was changed since" if is_changed else "is not of the bundle"
-        raise FormatError(
-            f"{folder} is not replaced: {name} {why}; move the folder away, or choose another "
-            "name or folder"
-        )
+    require_unedited(folder, _card_hashes(folder), _REPLACED, "bundle", "name or folder")
 
 
 def write_bundle(

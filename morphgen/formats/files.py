@@ -52,15 +52,16 @@ def folder_hashes(folder: Path) -> dict[str, str]:
     }
 
 
-def first_edit(
-    folder: Path, hashes: Mapping[str, object], generated: Collection[str]
-) -> tuple[str, bool] | None:
-    """Return the first file of a folder that is not as it was written.
+def require_unedited(
+    folder: Path, hashes: Mapping[str, object], generated: Collection[str], kind: str, choice: str
+) -> None:
+    """Require that a folder, such as a bundle, holds no work of the user.
 
-    Returns:
-        Path of the file, and whether it was changed (True) or added (False); None without such a
-        file. Links are followed; one that leads to no file counts as changed or added. Missing
-        files and ``SYSTEM_FILES`` do not count.
+    Links are followed; one that leads to no file counts as changed or added. Missing files and
+    ``SYSTEM_FILES`` do not count.
+
+    generated: Files that may differ from their hashes.
+    choice: What the user can choose instead, for the error.
     """
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -68,8 +69,11 @@ def first_edit(
         if not is_entry or name in generated or path.name in SYSTEM_FILES:
             continue
         if hashes.get(name) != (file_sha256(path) if path.is_file() else ""):
-            return name, name in hashes
-    return None
+            why = "was changed since" if name in hashes else f"is not of the {kind}"
+            raise FormatError(
+                f"{folder} is not replaced: {name} {why}; move the folder away, or choose another "
+                f"{choice}"
+            )
 
 
 def require_writable_file(path: Path, name: str = "", suffix: str = "") -> None:
@@ -247,9 +251,4 @@ def _require_replaceable(folder: Path, robot_name: str) -> None:
             f"{folder} is an export of robot {data.get('robot')!r}, not of {robot_name!r}; move it "
             "away, or choose another --out"
         )
-    if edit := first_edit(folder, written, {MANIFEST}):
-        name, is_changed = edit
-        why = "was changed after the export" if is_changed else "is not of the export"
-        raise FormatError(
-            f"{folder} is not replaced: {name} {why}; move the folder away, or choose another --out"
-        )
+    require_unedited(folder, written, {MANIFEST}, "export", "--out")

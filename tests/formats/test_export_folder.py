@@ -32,7 +32,7 @@ def test_unchanged_export_is_replaced(tmp_path):
     ("file", "message"),
     [
         ("notes.txt", "notes.txt is not of the export"),
-        ("meshes/a.stl", "meshes/a.stl was changed after the export"),
+        ("meshes/a.stl", "meshes/a.stl was changed since"),
         (MANIFEST, "files: expected an object"),
     ],
 )
