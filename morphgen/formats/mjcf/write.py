@@ -38,7 +38,8 @@ class Meshes:
     def __init__(self, mesh_file: MeshFile | None = None) -> None:
         self._mesh_file = mesh_file
         self._names: dict[tuple[Mesh, bool], str] = {}
-        self._files: dict[str, str] = {}
+        self._taken: set[str] = set()
+        self._files: dict[str, str] = {}  # names by file
         self._vertices: dict[str, Array] = {}
 
     def name(self, mesh: Mesh, *, collision: bool) -> str:
@@ -50,7 +51,7 @@ class Meshes:
 
     def write(self, asset: etree._Element) -> None:
         """Add a ``<mesh>`` for every file and every flat hull."""
-        for name, file in self._files.items():
+        for file, name in self._files.items():
             etree.SubElement(asset, "mesh", name=name, file=file, inertia="shell")
         for name, vertices in self._vertices.items():
             vertex = join(vertices.ravel().tolist())
@@ -75,21 +76,15 @@ class Meshes:
         if collision:
             corners = _thickened(np.asarray(load_mesh(mesh).vertices, dtype=np.float64))
             if corners is not None:
-                name = self._free_name(mesh.path.stem + "_flat")
+                name = take_name(f"{mesh.path.stem}_flat", self._taken)
                 self._vertices[name] = corners
                 return name
         if self._mesh_file is None:
-            return self._free_name(mesh.path.stem)
+            return take_name(mesh.path.stem, self._taken)
         file = self._mesh_file(mesh)
-        for name, known in self._files.items():
-            if known == file:
-                return name
-        name = self._free_name(PurePosixPath(file).stem)
-        self._files[name] = file
-        return name
-
-    def _free_name(self, stem: str) -> str:
-        return take_name(stem, {*self._names.values(), *self._files, *self._vertices})
+        if file not in self._files:
+            self._files[file] = take_name(PurePosixPath(file).stem, self._taken)
+        return self._files[file]
 
 
 def geom_attributes(shape: Shape, meshes: Meshes, *, collision: bool) -> dict[str, str]:
