@@ -9,14 +9,13 @@ import shutil
 import tempfile
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from functools import lru_cache
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
 from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.data_files import read_json
-from morphgen.formats.resolve import file_stamp
+from morphgen.formats.resolve import cached_until_changed
 
 SYSTEM_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
 """Files that file managers write into the folders that they show."""
@@ -29,14 +28,9 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+@cached_until_changed
 def content_sha256(path: Path) -> str:
-    """Return the SHA-256 of a file; cached until it changes."""
-    return _content_sha256(path.absolute(), file_stamp(path))
-
-
-@lru_cache(maxsize=4096)
-def _content_sha256(path: Path, stamp: tuple[int, int]) -> str:
-    del stamp
+    """Return the SHA-256 of a file."""
     try:
         return file_sha256(path)
     except OSError as error:

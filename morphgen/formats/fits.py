@@ -22,7 +22,7 @@ from msgspec import Meta
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import content_sha256, write_cache_file
 from morphgen.formats.records import FiniteNumber, PositiveNumber, Record, read_record
-from morphgen.formats.resolve import file_stamp
+from morphgen.formats.resolve import cached_until_changed
 from morphgen.formats.rounding import format_number
 from morphgen.model.geometry import (
     Box,
@@ -182,7 +182,7 @@ def with_stored_fits(robot: Robot, folders: Iterable[Path]) -> Robot:
 
 def read_fits(path: Path) -> dict[str, StoredFit]:
     """Return the fits of one file; none if another version of the fitter wrote it."""
-    return dict(_read(path.absolute(), file_stamp(path)))
+    return dict(_read(path))
 
 
 def fits_text(fits: Mapping[str, StoredFit]) -> str:
@@ -214,10 +214,8 @@ def shape_to_data(shape: Shape) -> dict[str, object]:
     }
 
 
-@lru_cache(maxsize=256)
-def _read(path: Path, stamp: tuple[int, int]) -> dict[str, StoredFit]:
-    """Read the fits of a file; ``stamp`` makes the cache read it again after a change."""
-    del stamp
+@cached_until_changed
+def _read(path: Path) -> dict[str, StoredFit]:
     data = read_json(path)
     if isinstance(data, dict) and data.get("fitter", FITTER_VERSION) != FITTER_VERSION:
         return {}

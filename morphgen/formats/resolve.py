@@ -6,18 +6,20 @@ import difflib
 import importlib.metadata
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.resources import files
 from itertools import product
 from pathlib import Path, PurePosixPath
-from typing import Literal
+from typing import Literal, TypeVar
 from urllib.parse import unquote
 
 from morphgen.errors import FormatError
 from morphgen.formats.xacro.evaluator import RefusedError
+
+T = TypeVar("T")
 
 REQUIREMENTS = {"rtb-data": "rtb-data==1.1.0", "example-robot-data": "example-robot-data"}
 """pip requirement of each distribution that provides robot files."""
@@ -284,6 +286,17 @@ def file_stamp(path: Path) -> tuple[int, int]:
         return (0, 0)
     status = path.stat()
     return (status.st_mtime_ns, status.st_size)
+
+
+def cached_until_changed(function: Callable[[Path], T]) -> Callable[[Path], T]:
+    """Cache the results of a function of a file; a file that changed is read again."""
+
+    @lru_cache(maxsize=4096)
+    def cached(path: Path, stamp: tuple[int, int]) -> T:
+        del stamp
+        return function(path)
+
+    return lambda path: cached(path.absolute(), file_stamp(path))
 
 
 def portable_uri(path: Path) -> str:

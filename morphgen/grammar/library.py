@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from functools import cached_property, lru_cache
+from functools import cached_property
 from importlib.resources import files
 from os import PathLike
 from pathlib import Path
@@ -12,11 +12,12 @@ from typing import TypeAlias
 
 from morphgen.arguments import path_argument
 from morphgen.errors import PartError, nearest
-from morphgen.formats.resolve import file_stamp
+from morphgen.formats.resolve import cached_until_changed
 from morphgen.grammar.manifest import PART_KINDS, Manifest, PartKind, read_manifest
 
 LIBRARY_VARIABLE = "MORPHGEN_LIBRARY"
 """Environment variable with folders of a user's own parts, separated as in ``PATH``."""
+_manifest = cached_until_changed(read_manifest)
 
 
 LibraryFolders: TypeAlias = str | PathLike[str] | Iterable[str | PathLike[str]]
@@ -86,14 +87,3 @@ def library_folders(folders: LibraryFolders) -> tuple[Path, ...]:
 def shipped_folders() -> tuple[Path, ...]:
     """Return the folders of the parts that come with morphgen."""
     return tuple(Path(str(files(f"morphgen.{name}"))) for name in ("templates", "robots_real"))
-
-
-def _manifest(path: Path) -> Manifest:
-    return _read(path, file_stamp(path))
-
-
-@lru_cache(maxsize=1024)
-def _read(path: Path, stamp: tuple[int, int]) -> Manifest:
-    """Read a manifest; the stamp makes the cache forget a file that changed."""
-    del stamp
-    return read_manifest(path)
