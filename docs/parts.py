@@ -8,6 +8,7 @@ With names of parts, only their pictures are drawn, and those of parts that have
 from __future__ import annotations
 
 import argparse
+import re
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -40,14 +41,15 @@ def tables() -> Iterator[str]:
     """Yield the lines of the sections."""
     for kind, title in KINDS.items():
         yield f"\n## {title}\n"
-        yield "| picture | part | joints | reach [m] | mass [kg] | source | licence |"
-        yield "|---|---|---|---|---|---|---|"
+        yield "| part | joints | reach [m] | mass [kg] | licence |"
+        yield "|---|---|---|---|---|"
         for row in shown_parts(kind):
             name = row["name"]
+            summary = re.sub(r", \d+ DoF", "", str(row["summary"]))
+            template = ", template" if row["source"] == "template" else ""
             yield (
-                f"| ![{name}](images/parts/{name}.png) | `{name}`<br>{row['summary']} "
-                f"| {row['dof']} | {row['reach']:.2f} | {row['mass']:.3g} | {row['source']} "
-                f"| {row['licence']} |"
+                f"| ![{name}](images/parts/{name}.png)<br>`{name}`<br>{summary} | {row['dof']} "
+                f"| {row['reach']:.2f} | {row['mass']:.3g} | {row['licence']}{template} |"
             )
 
 
