@@ -41,7 +41,7 @@ RECORDS = {
     "Parameter": "Parameter",
 }
 """Heading of the section about each record of the schema."""
-LONGEST_EXAMPLE = 80
+LONGEST_EXAMPLE = 50
 """Longest example that is not cut [characters]."""
 
 
@@ -118,15 +118,15 @@ def table(
     title: str, record: dict[str, Any], keys: list[str], examples: list[dict[str, Any]]
 ) -> Iterator[str]:
     """Yield a section with a row for each key."""
-    yield f"\n## {title}\n\n| key | type | unit | default | meaning | example |"
-    yield "|---|---|---|---|---|---|"
+    yield f"\n## {title}\n\n| key | value | meaning | example |"
+    yield "|---|---|---|---|"
     for key in keys:
         schema = record["properties"][key]
-        unit = "".join(re.findall(r" \[(.*?)\]", schema["description"]))
-        meaning = re.sub(r" \[.*?\]", "", schema["description"])
-        default = "required" if key in record.get("required", ()) else _default(schema)
+        unit = "".join(f" [{name}]" for name in re.findall(r" \[(.*?)\]", schema["description"]))
+        meaning = re.sub(r" \[.*?\]", "", schema["description"]).removesuffix(".")
+        default = ", required" if key in record.get("required", ()) else _default(schema)
         shown = _example([data[key] for data in examples if data.get(key) not in (None, {}, [])])
-        yield f"| `{key}` | {_type(schema)} | {unit} | {default} | {meaning} | {shown} |"
+        yield f"| `{key}` | {_type(schema)}{unit}{default} | {meaning} | {shown} |"
 
 
 def _mappings(data: object) -> Iterator[dict[str, Any]]:
@@ -164,7 +164,7 @@ def _type(schema: dict[str, Any]) -> str:
 
 def _default(schema: dict[str, Any]) -> str:
     default = schema["default"]
-    return "" if default in (None, "", (), [], {}) else f"`{_yaml(default)}`"
+    return "" if default in (None, "", (), [], {}) else f", default `{_yaml(default)}`"
 
 
 def _example(values: list[object]) -> str:
