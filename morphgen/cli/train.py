@@ -342,9 +342,11 @@ def finetune(args: argparse.Namespace) -> None:
 
 def _finetuning_config(file: Path, args: argparse.Namespace) -> RunConfig:
     initial, _ = read_checkpoint(file)
-    source = other_side(initial.source, args.on)
+    source: Source
     if args.words:
         source = robots_to_train(args.words, args, args.on)
+    else:
+        source = other_side(initial.source, args.on)  # drawn robots have none
     changes: dict[str, Any] = parse_constants(args.set)
     if unknown := set(changes) - {field.name for field in fields(PPOConfig)}:
         raise TaskError(f"--set {min(unknown)}: the networks are those of the checkpoint")
