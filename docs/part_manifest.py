@@ -17,10 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import yaml
 from msgspec.structs import fields
 
-from morphgen.grammar.library import default_library
 from morphgen.grammar.manifest import (
     REAL_ONLY,
     SCHEMA_FILE,
@@ -41,8 +39,6 @@ RECORDS = {
     "Parameter": "Parameter",
 }
 """Heading of the section about each record of the schema."""
-LONGEST_EXAMPLE = 50
-"""Longest example that is not cut [characters]."""
 
 
 def manifest_schema() -> dict[str, Any]:
@@ -93,10 +89,6 @@ def page() -> str:
 def tables() -> Iterator[str]:
     """Yield the sections with the keys of a manifest and of the records in it."""
     records = manifest_schema()["$defs"]
-    manifests = [
-        yaml.safe_load(path.read_text(encoding="utf-8"))
-        for path in default_library().paths.values()
-    ]
     keys = list(records["Manifest"]["properties"])
     sections = {
         "Keys of every part": [k for k in keys if k not in REAL_ONLY | TEMPLATE_ONLY],
@@ -104,39 +96,21 @@ def tables() -> Iterator[str]:
         "Keys of a part with `source`": [k for k in keys if k in REAL_ONLY],
     }
     for title, names in sections.items():
-        yield from table(title, records["Manifest"], names, manifests)
-    values = list(_mappings(manifests))
+        yield from table(title, records["Manifest"], names)
     for name, title in RECORDS.items():
-        record = records[name]
-        keys = list(record["properties"])
-        needed = set(record.get("required", keys[:1]))
-        examples = [value for value in values if needed <= set(value) <= set(keys)]
-        yield from table(title, record, keys, examples)
+        yield from table(title, records[name], list(records[name]["properties"]))
 
 
-def table(
-    title: str, record: dict[str, Any], keys: list[str], examples: list[dict[str, Any]]
-) -> Iterator[str]:
+def table(title: str, record: dict[str, Any], keys: list[str]) -> Iterator[str]:
     """Yield a section with a row for each key."""
-    yield f"\n## {title}\n\n| key | value | meaning | example |"
-    yield "|---|---|---|---|"
+    yield f"\n## {title}\n\n| key | value | meaning |"
+    yield "|---|---|---|"
     for key in keys:
         schema = record["properties"][key]
         unit = "".join(f" [{name}]" for name in re.findall(r" \[(.*?)\]", schema["description"]))
         meaning = re.sub(r" \[.*?\]", "", schema["description"]).removesuffix(".")
         default = ", required" if key in record.get("required", ()) else _default(schema)
-        shown = _example([data[key] for data in examples if data.get(key) not in (None, {}, [])])
-        yield f"| `{key}` | {_type(schema)}{unit}{default} | {meaning} | {shown} |"
-
-
-def _mappings(data: object) -> Iterator[dict[str, Any]]:
-    """Yield every mapping in nested data."""
-    if isinstance(data, dict):
-        yield data
-    for value in (
-        data.values() if isinstance(data, dict) else data if isinstance(data, list) else ()
-    ):
-        yield from _mappings(value)
+        yield f"| `{key}` | {_type(schema)}{unit}{default} | {meaning} |"
 
 
 def _type(schema: dict[str, Any]) -> str:
@@ -164,21 +138,7 @@ def _type(schema: dict[str, Any]) -> str:
 
 def _default(schema: dict[str, Any]) -> str:
     default = schema["default"]
-    return "" if default in (None, "", (), [], {}) else f", default `{_yaml(default)}`"
-
-
-def _example(values: list[object]) -> str:
-    """Return the shortest of the values that shipped manifests have."""
-    if not values:
-        return ""
-    text = min((_yaml(value) for value in values), key=lambda text: (len(text), text))
-    cut = text if len(text) <= LONGEST_EXAMPLE else f"{text[: LONGEST_EXAMPLE - 3]}..."
-    return f"`{cut}`"
-
-
-def _yaml(value: object) -> str:
-    dumped = yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False)
-    return dumped.removesuffix("...\n").strip()
+    return "" if default in (None, "", (), [], {}) else f", default `{json.dumps(default)}`"
 
 
 if __name__ == "__main__":

@@ -41,15 +41,15 @@ def tables() -> Iterator[str]:
     """Yield the lines of the sections."""
     for kind, title in KINDS.items():
         yield f"\n## {title}\n"
-        yield "| part | joints | reach [m] | mass [kg] | licence |"
-        yield "|---|---|---|---|---|"
+        yield "| part | joints | reach [m] | licence |"
+        yield "|---|---|---|---|"
         for row in shown_parts(kind):
             name = row["name"]
             summary = re.sub(r", \d+ DoF", "", str(row["summary"]))
             template = ", template" if row["source"] == "template" else ""
             yield (
                 f"| ![{name}](images/parts/{name}.png)<br>`{name}`<br>{summary} | {row['dof']} "
-                f"| {row['reach']:.2f} | {row['mass']:.3g} | {row['licence']}{template} |"
+                f"| {row['reach']:.2f} | {row['licence']}{template} |"
             )
 
 
