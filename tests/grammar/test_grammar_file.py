@@ -197,7 +197,7 @@ def test_all_units_distributions_and_properties_are_documented():
         assert name in PAGE
     (units,) = re.findall(r"\*\*Units\*\* are (.*?)\.", PAGE)
     assert set(units.split(", ")) == set(UNITS)
-    assert len(EXAMPLES) == 3
+    assert len(EXAMPLES) == 2
     assert pin(shipped("chain"), ["beads=5", "bead.rod=3cm", "radius=2cm"], LIBRARY)
 
 
