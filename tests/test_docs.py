@@ -123,12 +123,8 @@ EXAMPLES = [
 def test_python_examples_run(text, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    if "data/" in text:
-        assert main(["split", "build", "extrapolation/arms/reach", "--goals", "--light"]) == 0
     if "import gymnasium" in text:  # which finds the environments if it is imported first
         register_gym_envs()
-    if "cuda" in text and not pytest.importorskip("torch").cuda.is_available():
-        text = text.replace('device="cuda"', 'device="cpu"')
     exec(text, {"__name__": "__main__"})
 
 
