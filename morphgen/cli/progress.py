@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, NoReturn, TypeVar
@@ -23,14 +24,14 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-LINE_INTERVAL = 60.0
+LINE_INTERVAL = 10.0
 """Time between two lines about an evaluation where there is no terminal [s]."""
 REDRAW_INTERVAL = 1.0
 """Time after which a bar appears, and between its updates if nothing else happens [s]."""
 GOAL_LINE_INTERVAL = 5.0
 """Time between two lines about goal sets that are made, where there is no terminal [s]."""
-TRAINING_LINES = 20
-"""Number of lines about a training where there is no terminal."""
+UPDATE_LINE_INTERVAL = 10.0
+"""Time between two lines about a training where there is no terminal [s]."""
 
 
 @contextmanager
@@ -188,7 +189,7 @@ class TrainingProgress:
         # The score of a step of push is 1 where it succeeds, else 0: its mean says nothing.
         is_relative = any(TASKS[task].relative_to_random for task in tasks_of(source))
         metric = "score" if is_relative else "reward"
-        show = partial(_print_update, name)
+        show = _update_lines(name)
         if sys.stderr.isatty():
             shown: tqdm[NoReturn] = tqdm(
                 desc=name,
@@ -237,18 +238,25 @@ def _draw_update(
     shown.update(report.transitions - shown.n)
 
 
-def _print_update(name: str, report: UpdateMetrics, total: int, facts: Mapping[str, str]) -> None:
-    # The last update always has its line.
-    if report.update % max(total // TRAINING_LINES, 1) and report.update < total:
-        return
-    # Every update has equally many transitions.
-    seconds_left = (total - report.update) * report.transitions / report.update
-    seconds_left /= report.steps_per_second
-    note(
-        f"{name}: update {report.update} of {total}, {report.transitions:,} steps, "
-        f"{', '.join(map(' '.join, facts.items()))}, "
-        f"{report.steps_per_second:,.0f} steps/s, {seconds_left / 60:.1f} min left"
-    )
+def _update_lines(name: str) -> Callable[[UpdateMetrics, int, Mapping[str, str]], None]:
+    """Return a function that prints the first update, the last one, and others at intervals."""
+    last = -math.inf
+
+    def show(report: UpdateMetrics, total: int, facts: Mapping[str, str]) -> None:
+        nonlocal last
+        if time.monotonic() < last + UPDATE_LINE_INTERVAL and report.update < total:
+            return
+        last = time.monotonic()
+        # Every update has equally many transitions.
+        seconds_left = (total - report.update) * report.transitions / report.update
+        seconds_left /= report.steps_per_second
+        note(
+            f"{name}: update {report.update} of {total}, {report.transitions:,} steps, "
+            f"{', '.join(map(' '.join, facts.items()))}, "
+            f"{report.steps_per_second:,.0f} steps/s, {seconds_left / 60:.1f} min left"
+        )
+
+    return show
 
 
 def _at_intervals(interval: float, line: str) -> Progress:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import shlex
 import sys
@@ -51,6 +52,8 @@ from morphgen.rl.runs.robot_source import (
     SplitSource,
     draw,
     drawn_source,
+    members,
+    num_drawn,
     other_side,
     robot_source,
     split_of,
@@ -183,7 +186,10 @@ def train(args: argparse.Namespace) -> None:
 
 
 def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> None:
-    """Train in a folder with a progress bar, and print the paths of the checkpoints."""
+    """Say what is trained, train in a folder with progress, print the paths of the checkpoints."""
+    training.require_trainable(folder, config, resume=args.resume)
+    if os.environ.get("RANK", "0") == "0":  # else the first process of torchrun says it
+        note(_described(folder, config))
     with training_progress("with --resume") as display:
         execution = execution_config(args)
         if isinstance(config.source, GrammarSource) and not SIMULATORS[config.sim].takes_workers:
@@ -199,6 +205,18 @@ def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> N
         note(f"stopped after {args.minutes} minutes{what}; it continues with --resume")
     elif subruns:  # the first process of torchrun alone says it
         note(_next_command(folder, config))
+
+
+def _described(folder: Path, config: RunConfig) -> str:
+    """Return in a line what a run trains on what, and where."""
+    source, ppo = config.source, config.ppo
+    number = len(members(source)) or num_drawn(source) or 1
+    robots = "1 robot" if number == 1 else f"{number} robots"
+    return (
+        f"training {config.policy.agent} at {', '.join(tasks_of(source))} on {source.name} "
+        f"({robots}): {ppo.total_timesteps:,} steps in {config.num_envs} environments of "
+        f"{config.sim}, networks on {config.device}; folder {folder}"
+    )
 
 
 def _next_command(folder: Path, config: RunConfig) -> str:

@@ -399,9 +399,7 @@ def train(
     processes of ``torchrun`` other than the first, which alone writes files.
     """
     execution, parts = execution or ExecutionConfig(), subruns_of(folder, config)
-    for part in parts:
-        require_runnable(part.config)
-    require_open(folder, config, resume=resume)
+    require_trainable(folder, config, resume=resume)
     unfinished = [part for part in parts if not is_done(part)]
     if unfinished:  # a finished run is evaluated on machines without its GPU
         require_device(config.device)
@@ -430,6 +428,13 @@ def train(
                 if _learn(learner, batches, part, writes, show, stop):
                     break
     return parts if processes.is_first else []
+
+
+def require_trainable(folder: Path, config: RunConfig, *, resume: bool) -> None:
+    """Require that ``train`` can begin or resume a run in a folder; write nothing."""
+    for part in subruns_of(folder, config):
+        require_runnable(part.config)
+    require_open(folder, config, resume=resume)
 
 
 def require_runnable(config: RunConfig) -> None:

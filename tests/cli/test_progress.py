@@ -1,5 +1,6 @@
 """Progress output: bars on a terminal, lines in a file, failures in both."""
 
+import re
 import sys
 from dataclasses import fields, replace
 from types import SimpleNamespace
@@ -42,18 +43,30 @@ def test_diverged_episodes_are_one_line_at_the_end(
     assert [text.partition(": ")[2] for text in lines] == ([expected] if line else [])
 
 
-def test_progress_is_printed_once_per_minute(capsys, monkeypatch):
+def test_progress_is_printed_every_ten_seconds(capsys, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     with training_progress(), stage("stochastic on test"):
         for i in range(1, 13):
-            now[0] += 11
+            now[0] += 2
             report(i / 2, 6)
     out, err = capsys.readouterr()
     assert (out, err.splitlines()) == (
         "",
         ["stochastic on test: 3 of 6 episodes", "stochastic on test: 6 of 6 episodes"],
     )
+
+
+def test_updates_are_printed_at_once_every_ten_seconds_and_at_the_end(capsys, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    with training_progress() as display:
+        show = display.training(SimpleNamespace(config=small_config()))
+        for update in range(1, 9):
+            show(replace(REPORT, update=update, transitions=32 * update), 8)
+            now[0] += 3
+    lines = capsys.readouterr().err.splitlines()
+    assert [re.search(r"update (\d) of 8", line)[1] for line in lines] == ["1", "5", "8"]
 
 
 def test_terminal_progress_bar_is_removed_at_the_end(capsys, monkeypatch):
