@@ -85,6 +85,14 @@ def commands(block):
     return [shlex.split(text, comments=True) for text in texts]
 
 
+def test_pages_are_short_enough_to_be_read():
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    words = {page.name: len(page.read_text(encoding="utf-8").split()) for page in pages}
+    assert words["README.md"] < 900
+    assert max(words.values()) <= 2500
+    assert sum(words.values()) < 26000
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_between_pages_are_valid(page):
     for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
