@@ -263,7 +263,10 @@ class FreeSpace:
         ((a, b), count), *_ = collisions.most_common(1)
         more = ""
         if num_refused:
-            more = f" and {num_refused:,} more are, but cut off by links that touch"
+            more = (
+                f" and {num_refused:,} more are, but cut off by links that touch, or refused by "
+                "the task"
+            )
         return BenchmarkError(
             f"robot {self.scene.robot.name!r}: only {num_accepted} of {tried:,} random "
             f"configurations are free of collisions{more} (acceptance rate "

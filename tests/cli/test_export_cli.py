@@ -9,11 +9,15 @@ from morphgen.checks.robot_srdf import MATRIX_SAMPLES, robot_srdf_text
 from morphgen.cli import export
 from morphgen.cli.command import read_commands
 from morphgen.encoding.robot_hash import robot_hash
-from morphgen.formats.bundle import file_findings, write_bundle
+from morphgen.formats.bundle import EXPORTS, file_findings, write_bundle
 from morphgen.formats.files import MANIFEST
 from morphgen.formats.fits import FITS
 from morphgen.formats.srdf import read_srdf
 from morphgen.tasks.scenes.env_specs import load_robot
+
+
+def test_a_bundle_knows_the_files_that_may_be_written_into_it():
+    assert set(EXPORTS) == set(export.FILES)
 
 
 def test_bundles_get_their_web_page_and_stay_valid(ok, tmp_path):
