@@ -174,7 +174,8 @@ def _recovered(text: str, origin: str) -> tuple[etree._Element | None, list[Find
         errors = [*parser.error_log]
         missing = {}
         for error in errors:
-            if match := _PREFIX.match(error.message):
+            match = _PREFIX.match(error.message)
+            if match and match[1] not in prefixes:  # one that stays undeclared is an error below
                 missing.setdefault(match[1], error.line)
         prefixes |= missing
     lines: dict[str, list[int]] = {}

@@ -86,6 +86,11 @@ def test_undeclared_prefixes_are_repaired():
     assert [finding.why.split("'")[1] for finding in findings] == ["drake", "gazebo", "last"]
 
 
+def test_a_prefix_that_cannot_be_declared_is_refused():
+    with pytest.raises(FormatError, match=r"^x\.urdf:1:9: error parsing attribute name"):
+        parse_description(b'<a:model="m"><b/></a:model>', "x.urdf")
+
+
 def test_other_errors_are_found_despite_undeclared_prefixes():
     with pytest.raises(FormatError, match=r"^r.urdf:1:\d+: "):
         parse_description(b"<robot><drake:a></robot>", "r.urdf")
