@@ -41,7 +41,7 @@ def test_robots_are_chosen_compared_played_and_split(same, folder, picture):
     picture(page, "gallery-chosen")
     page.locator("a.card").nth(3).click()
     page.get_by_text("no self-collision").or_(page.get_by_text("collide")).first.wait_for()
-    assert page.locator("input[data-choose]").is_checked()
+    page.locator("input[data-choose]:checked").wait_for(state="attached")
     page.go_back()
     page.get_by_text("30 robots · page 1 of 2").wait_for()
     page.wait_for_function("document.querySelectorAll('input[data-choose]:checked').length == 3")
