@@ -28,7 +28,7 @@ from morphgen.benchmark.scores.study import (
 from morphgen.benchmark.split_folder import read_split_or_folder
 from morphgen.cli import options as opt
 from morphgen.cli.progress import note, status, training_progress
-from morphgen.encoding.tokens import default_max_links
+from morphgen.encoding.tokens import default_max_links, require_max_links
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.rl.agents import AGENTS, preset_of
 from morphgen.rl.config import (
@@ -277,6 +277,7 @@ def _drawn(config: RunConfig, source: GrammarSource, args: argparse.Namespace) -
         note(f"morphgen: robots that were skipped: {reasons}")
     held_out = (read_split(name).max_links for name in source.held_out)
     max_links = args.max_links or default_max_links([robots.most_links, *held_out])
+    require_max_links(robots.most_links, "the largest of the drawn robots", max_links)
     drawn = replace(source, drawn_hash=robots.hash)
     return replace(config, source=drawn, max_links=max_links)
 

@@ -401,8 +401,6 @@ def train(
     execution, parts = execution or ExecutionConfig(), subruns_of(folder, config)
     require_trainable(folder, config, resume=resume)
     unfinished = [part for part in parts if not is_done(part)]
-    if unfinished:  # a finished run is evaluated on machines without its GPU
-        require_device(config.device)
     with _StopRequest(execution.minutes) as stop, ExitStack() as held:
         processes, device = held.enter_context(process_group(config.device))
         holds = False
@@ -432,9 +430,12 @@ def train(
 
 def require_trainable(folder: Path, config: RunConfig, *, resume: bool) -> None:
     """Require that ``train`` can begin or resume a run in a folder; write nothing."""
-    for part in subruns_of(folder, config):
+    parts = subruns_of(folder, config)
+    for part in parts:
         require_runnable(part.config)
     require_open(folder, config, resume=resume)
+    if not all(map(is_done, parts)):  # a finished run is evaluated on machines without its GPU
+        require_device(config.device)
 
 
 def require_runnable(config: RunConfig) -> None:
