@@ -238,8 +238,8 @@ class _Draft:
     required: frozenset[str]
     """Parts that some train robot must have if this is a test robot."""
     strata: tuple[list[_Item], ...]
-    """What is balanced, the most important group first: rules, parts that they hold for, alone or
-    in a combination, category, and parts by their kind."""
+    """Groups of items whose numbers are balanced, the most important group first: rules, parts that
+    they hold for (alone or in a combination), category, and parts by their kind."""
     order: str  # random text that decides between robots that are equally good
 
 

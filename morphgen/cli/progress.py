@@ -115,7 +115,8 @@ def track(
 
 def note(text: str) -> None:
     """Print a line that is no part of the command's result, which alone goes to stdout."""
-    print(text, file=sys.stderr, flush=True)
+    with tqdm.external_write_mode(file=sys.stderr):  # above the bars that are shown
+        print(text, file=sys.stderr, flush=True)
 
 
 def print_line(line: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import re
 import shlex
 import sys
@@ -187,15 +186,17 @@ def train(args: argparse.Namespace) -> None:
 
 def run_training(folder: Path, config: RunConfig, args: argparse.Namespace) -> None:
     """Say what is trained, train in a folder with progress, print the paths of the checkpoints."""
-    training.require_trainable(folder, config, resume=args.resume)
-    if os.environ.get("RANK", "0") == "0":  # else the first process of torchrun says it
-        note(_described(folder, config))
     with training_progress("with --resume") as display:
         execution = execution_config(args)
         if isinstance(config.source, GrammarSource) and not SIMULATORS[config.sim].takes_workers:
             execution = replace(execution, workers=1)  # those of --workers have drawn the robots
         subruns = training.train(
-            folder, config, resume=args.resume, execution=execution, show=display.training
+            folder,
+            config,
+            resume=args.resume,
+            execution=execution,
+            show=display.training,
+            begin=lambda: note(_described(folder, config)),
         )
     for subrun in subruns:
         if (subrun.folder / CHECKPOINT).is_file():

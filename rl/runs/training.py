@@ -385,6 +385,7 @@ def train(
     resume: bool = False,
     execution: ExecutionConfig | None = None,
     show: Callable[[Subrun], ShowMetrics] | None = None,
+    begin: Callable[[], None] | None = None,
     hold: Callable[[Path], AbstractContextManager[None]] = locked_folder,
 ) -> list[Subrun]:
     """Train all parts of a run to their end; see ``subruns_of``.
@@ -395,18 +396,26 @@ def train(
     the same weights as an uninterrupted one; one that was stopped does not, since all its episodes
     begin anew at another update. Nothing is written before all robots and networks are built.
 
+    ``begin`` is called once, when only building robots and networks may still refuse the run.
+
     Returns the parts, of which the last are unfinished or not begun after ``minutes``; none in
     processes of ``torchrun`` other than the first, which alone writes files.
     """
     execution, parts = execution or ExecutionConfig(), subruns_of(folder, config)
-    require_trainable(folder, config, resume=resume)
+    for part in parts:
+        require_runnable(part.config)
+    require_open(folder, config, resume=resume)
     unfinished = [part for part in parts if not is_done(part)]
+    if unfinished:  # a finished run is evaluated on machines without its GPU
+        require_device(config.device)
     with _StopRequest(execution.minutes) as stop, ExitStack() as held:
         processes, device = held.enter_context(process_group(config.device))
         holds = False
         for part in unfinished:
             if not holds:
                 require_links(config.source, config.max_links)
+                if begin is not None and processes.is_first:
+                    begin()
             envs = processes.share(part.config.num_envs, "--envs")
             with nullcontext() if processes.is_first else show_progress(None):
                 batches = TrainingBatches(
@@ -426,16 +435,6 @@ def train(
                 if _learn(learner, batches, part, writes, show, stop):
                     break
     return parts if processes.is_first else []
-
-
-def require_trainable(folder: Path, config: RunConfig, *, resume: bool) -> None:
-    """Require that ``train`` can begin or resume a run in a folder; write nothing."""
-    parts = subruns_of(folder, config)
-    for part in parts:
-        require_runnable(part.config)
-    require_open(folder, config, resume=resume)
-    if not all(map(is_done, parts)):  # a finished run is evaluated on machines without its GPU
-        require_device(config.device)
 
 
 def require_runnable(config: RunConfig) -> None:

@@ -150,7 +150,7 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 - any argument of an environment
 
 
 class BatchEnv:
-    """What one environment and a vector of them have in common: pictures, specification, copies.
+    """Pictures, specification and copies of a Gymnasium environment, single or a vector.
 
     Attributes:
         batch: The batch, which it owns.
