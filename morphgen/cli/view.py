@@ -17,6 +17,9 @@ from morphgen.viewer.app.app import Viewer, serve
 
 SIGNAL_POLL = 0.5
 """Longest delay before a signal is handled [s]."""
+QUIET_TIME = 2.0
+"""Time without work for a browser after which the first rollout is prepared [s]: the first page
+draws pictures, which would take longer beside it."""
 STOP_GRACE = 5.0
 """Time in which work has to end after a signal; then it is given up [s]."""
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
@@ -41,12 +44,12 @@ def _wait(host: str, viewer: Viewer) -> None:
             )
         name = f"[{host}]" if ":" in host else host
         print(f"http://{name}:{viewer.port}  (stop with Ctrl-C)", flush=True)
-        is_warm = False
+        connected = 0.0  # time for which a browser has been connected [s]
         while True:  # a signal that another thread receives does not end a sleep
             time.sleep(SIGNAL_POLL)
-            if viewer.sessions and not is_warm:
+            connected += SIGNAL_POLL * bool(viewer.sessions)
+            if min(connected, viewer.workers.idle_time) >= QUIET_TIME:
                 viewer.warm_up()
-                is_warm = True
     finally:
         for signal_name in (signal.SIGINT, *STOP_SIGNALS):
             signal.signal(signal_name, signal.SIG_IGN)  # a second one would leave uploads behind

@@ -46,6 +46,24 @@ def test_closing_workers_interrupts_their_work_and_ends_their_processes(tmp_path
     assert not alive(process)
 
 
+def test_workers_are_idle_only_without_calls(workers, tmp_path):
+    assert not workers.is_used
+    assert workers.idle_time > 0
+    started = tmp_path / "started"
+    running = workers.submit(sleep_from, started)
+    while not started.exists():
+        time.sleep(0.01)
+    assert workers.is_used
+    assert workers.idle_time == 0
+    workers.close()
+    with pytest.raises(CancelledError):
+        running.result(timeout=60)
+    until = time.monotonic() + 30
+    while not workers.idle_time and time.monotonic() < until:
+        time.sleep(0.01)
+    assert workers.idle_time > 0
+
+
 def alive(process):
     try:
         os.kill(process, 0)

@@ -63,8 +63,9 @@ class Viewer:
         return self.server.get_port()
 
     def warm_up(self) -> None:
-        """Load what the first rollout needs, in its process, while nobody waits for it."""
-        self.simulator.submit(named("morphgen.viewer.simulation:warm_up"), self.files)
+        """Load what the first rollout needs, in its process, unless a rollout began before."""
+        if not self.simulator.is_used:
+            self.simulator.submit(named("morphgen.viewer.simulation:warm_up"), self.files)
 
     def stop(self) -> None:
         """End all sessions, the server and its workers, and delete the uploads."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -30,6 +31,8 @@ class Workers:
         """Prepare a pool of ``n`` processes; they start with the first work."""
         self._n = n
         self._lock = threading.Lock()
+        self.is_used = False  # whether a call was ever submitted
+        self._num_calls, self._ended = 0, time.monotonic()
         self._context = get_context("spawn")  # threads and OpenGL do not survive a fork
         self._stopped: c_byte = self._context.RawValue("b", 0)
         self._pool = self._new_pool()
@@ -38,12 +41,27 @@ class Workers:
         """Queue a function call for a process."""
         with self._lock, sigint_blocked():
             try:
-                return self._pool.submit(call_in_worker, work, *arguments)
+                future = self._pool.submit(call_in_worker, work, *arguments)
             except BrokenProcessPool:
                 if not self._stopped.value:
                     self._pool.shutdown(wait=False, cancel_futures=True)
                     self._pool = self._new_pool()
-                return self._pool.submit(call_in_worker, work, *arguments)
+                future = self._pool.submit(call_in_worker, work, *arguments)
+            self.is_used = True
+            self._num_calls += 1
+        future.add_done_callback(self._note_end)
+        return future
+
+    def _note_end(self, _future: Future[Any]) -> None:
+        with self._lock:
+            self._num_calls -= 1
+            self._ended = time.monotonic()
+
+    @property
+    def idle_time(self) -> float:
+        """Time since the last call ended, or since the start; 0 while calls run or wait [s]."""
+        with self._lock:
+            return 0.0 if self._num_calls else time.monotonic() - self._ended
 
     def result(self, future: Future[T]) -> T:
         """Wait for the result of a call."""
