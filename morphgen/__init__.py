@@ -16,8 +16,10 @@ if TYPE_CHECKING:
     from morphgen.api.benchmark import similarity, tokens
     from morphgen.api.checks import check, conform, fix
     from morphgen.api.environments import make_env
+    from morphgen.api.evaluation import evaluate, play
     from morphgen.api.robots import compose, fit, read, sample, write
     from morphgen.api.splits import split
+    from morphgen.api.training import train
     from morphgen.errors import MorphgenError
     from morphgen.model.robot import Robot
 
@@ -30,14 +32,17 @@ __all__ = [
     "check",
     "compose",
     "conform",
+    "evaluate",
     "fit",
     "fix",
     "make_env",
+    "play",
     "read",
     "sample",
     "similarity",
     "split",
     "tokens",
+    "train",
     "write",
 ]
 
@@ -47,14 +52,17 @@ _MODULES = {
     "check": "morphgen.api.checks",
     "compose": "morphgen.api.robots",
     "conform": "morphgen.api.checks",
+    "evaluate": "morphgen.api.evaluation",
     "fit": "morphgen.api.robots",
     "fix": "morphgen.api.checks",
     "make_env": "morphgen.api.environments",
+    "play": "morphgen.api.evaluation",
     "read": "morphgen.api.robots",
     "sample": "morphgen.api.robots",
     "similarity": "morphgen.api.benchmark",
     "split": "morphgen.api.splits",
     "tokens": "morphgen.api.benchmark",
+    "train": "morphgen.api.training",
     "write": "morphgen.api.robots",
 }
 """Module of each public name."""
@@ -71,7 +79,14 @@ if not TYPE_CHECKING:  # to type checkers, a name that is not imported above is 
             return _import_module("morphgen.tasks")
         if name not in _MODULES:
             raise AttributeError(f"module 'morphgen' has no attribute {name!r}")
-        return getattr(_import_module(_MODULES[name]), name)
+        try:
+            return getattr(_import_module(_MODULES[name]), name)
+        except ModuleNotFoundError:
+            # Said when the function is called, so that `import *` works without optional packages.
+            extras = _import_module("morphgen.extras")
+            return extras.explain_missing_extras("rl")(
+                lambda *_, **__: _import_module(_MODULES[name])
+            )
 
     def __dir__() -> list[str]:
         return [name for name in __all__ if name not in _UNLISTED]

@@ -35,12 +35,15 @@ def missing_extra(error: Exception, wanted: str = "") -> str | None:
 
 
 @contextmanager
-def explain_missing_extras() -> Iterator[None]:
-    """Convert the failed import of an optional package to an error that says how to install it."""
+def explain_missing_extras(wanted: str = "") -> Iterator[None]:
+    """Convert the failed import of an optional package to an error that says how to install it.
+
+    wanted: The extra of morphgen to install, if it has the package.
+    """
     try:
         yield
     except ModuleNotFoundError as error:
-        text = missing_extra(error)
+        text = missing_extra(error, wanted)
         if text is None:
             raise
         raise MissingDependencyError(text) from error

@@ -5,6 +5,7 @@ The listener is in a context variable. A new thread or process has none: its rep
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
@@ -21,10 +22,13 @@ class Progress(Protocol):
 
 @runtime_checkable
 class StagedProgress(Progress, Protocol):
-    """A listener that shows stages of work by their titles."""
+    """A listener that shows stages of work by their titles, and notes."""
 
     def stage(self, title: str) -> AbstractContextManager[None]:
         """Show the reports of a block as a stage."""
+
+    def note(self, text: str) -> None:
+        """Show a line."""
 
 
 _listener: ContextVar[Progress | None] = ContextVar("listener", default=None)
@@ -92,6 +96,15 @@ def stage(title: str) -> AbstractContextManager[None]:
     """Give the work of a block a title, for listeners that show stages."""
     listener = _listener.get()
     return listener.stage(title) if isinstance(listener, StagedProgress) else nullcontext()
+
+
+def note(text: str) -> None:
+    """Show a line that a user should see: by a listener of stages, else as a logged warning."""
+    listener = _listener.get()
+    if isinstance(listener, StagedProgress):
+        listener.note(text)
+    else:
+        logging.getLogger("morphgen").warning(text)
 
 
 def _ignore(done: float, total: int | None) -> None:

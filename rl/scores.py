@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -343,6 +344,26 @@ def write_scores(path: Path, scores_by_mode: Scores) -> None:
         for mode, rows in data.items():
             writer.writerows({"mode": mode, **row} for row in rows)
         write_file(path, text.getvalue())
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores of a policy or a baseline, robot by robot; its text is a table."""
+
+    scores: Mapping[str, tuple[Score, ...]]
+    """Scores by mode (``deterministic`` or ``stochastic``), or by the name of a baseline."""
+
+    def as_dict(self) -> dict[str, list[dict[str, Any]]]:
+        """Return the scores as JSON values, with null instead of nan."""
+        return {mode: scores_to_json(scores) for mode, scores in self.scores.items()}
+
+    def __str__(self) -> str:
+        """Return a line per robot and mode, then the means of each mode."""
+        return f"{score_table(self.scores)}\n{summary(self.scores)}"
+
+    def write(self, path: str | PathLike[str]) -> None:
+        """Write CSV, JSON or Markdown, by the suffix of the path."""
+        write_scores(Path(path), self.scores)
 
 
 def _row(mode: str, score: Score) -> tuple[str, ...]:

@@ -20,13 +20,16 @@ FUNCTIONS = (
     "check",
     "compose",
     "conform",
+    "evaluate",
     "fit",
     "make_env",
+    "play",
     "read",
     "sample",
     "similarity",
     "split",
     "tokens",
+    "train",
     "write",
 )
 

@@ -254,7 +254,12 @@ def test_missing_extra_error_says_how_to_install_it(words, extra, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("call", "extra"), [('fit("z1")', "fit"), ('make_env("reach", "prims")', "tasks")]
+    ("call", "extra"),
+    [
+        ('fit("z1")', "fit"),
+        ('make_env("reach", "prims")', "tasks"),
+        ('train("prims task=reach")', "rl"),
+    ],
 )
 def test_missing_extra_is_the_same_error_in_python(call, extra, tmp_path):
     statements = f"""

@@ -155,7 +155,9 @@ def _option(signature: str, text: str, names: Mapping[str, Any]) -> tuple[str, d
         settings |= {"action": argparse.BooleanOptionalAction, "default": None}
         name = name.replace("[no-]", "")
     elif entry["value"] is None and name.startswith("-"):
-        settings |= {"action": "store_true", "default": False}
+        # A flag that turns an attribute off has its name: --no-tensorboard -> tensorboard.
+        is_off = entry["dest"] is not None
+        settings |= {"action": f"store_{str(not is_off).lower()}", "default": is_off}
     else:
         settings |= _value(entry["value"] or "", names, is_flag=name.startswith("-"))
     if settings.get("action") == "append":

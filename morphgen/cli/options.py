@@ -6,16 +6,14 @@ import argparse
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from inspect import signature
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from morphgen.cli.progress import note, track
-from morphgen.errors import BenchmarkError, FormatError, MorphgenError, TaskError, one_line
+from morphgen.errors import BenchmarkError, FormatError, MorphgenError, one_line
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.findings import Finding
 from morphgen.model.robot import Robot
-from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.task import TaskConfig
 
 if TYPE_CHECKING:  # it loads packages for meshes, which take seconds
     from morphgen.grammar.robot_source import RobotReference
@@ -23,21 +21,9 @@ if TYPE_CHECKING:  # it loads packages for meshes, which take seconds
 T = TypeVar("T")
 
 
-def with_goal(
-    configs: Iterable[TaskConfig], goal: str | None, tasks: Iterable[str]
-) -> tuple[TaskConfig, ...]:
-    """Return configs of tasks with the goal of reach that ``--goal`` names; None keeps it."""
-    if goal is None:
-        return tuple(configs)
-    if ReachConfig.task not in (names := tuple(dict.fromkeys(tasks))):
-        raise TaskError(
-            f"--goal {goal} is for task {ReachConfig.task}; the tasks of the robots: "
-            f"{' and '.join(names)}"
-        )
-    return tuple(
-        replace(config, goal=goal) if isinstance(config, ReachConfig) else config
-        for config in configs
-    )
+def arguments(args: argparse.Namespace, function: Callable[..., object]) -> dict[str, Any]:
+    """Return the arguments of a function that options of their names give."""
+    return {name: getattr(args, name) for name in signature(function).parameters if name in args}
 
 
 def print_result(args: argparse.Namespace, data: object, text: Callable[[], str]) -> None:

@@ -223,6 +223,10 @@ class TrainingProgress:
         with _bar(None, title, "episode", layout=layout, delay=0) as show, show_progress(show):
             yield
 
+    def note(self, text: str) -> None:
+        """Print a line above the bar."""
+        note(text)
+
     def close(self) -> None:
         """Finish the bar that is shown."""
         self._shown.close()

@@ -1,0 +1,428 @@
+"""Train policies: which robots, with which configuration."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from os import PathLike
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from morphgen.arguments import checked_signature
+from morphgen.benchmark.split_folder import read_split_or_folder
+from morphgen.encoding.tokens import default_max_links, require_max_links
+from morphgen.errors import BenchmarkError, TaskError
+from morphgen.grammar.library import LibraryFolders, library_folders
+from morphgen.progress import note
+from morphgen.rl.agents import AGENTS, preset_of
+from morphgen.rl.config import AgentSpec, configs_of, owners_of, parse_agent, parse_constants
+from morphgen.rl.runs.checkpoint import CHECKPOINT, RunConfig
+from morphgen.rl.runs.robot_source import (
+    GrammarSource,
+    OneRobot,
+    Source,
+    SplitSource,
+    draw,
+    drawn_source,
+    members,
+    num_drawn,
+    other_side,
+    robot_source,
+    split_of,
+    split_source,
+    tasks_of,
+)
+from morphgen.rl.runs.training import (
+    ExecutionConfig,
+    ShowMetrics,
+    Subrun,
+    default_slice_updates,
+    is_done,
+    num_slices,
+    require_runnable,
+)
+from morphgen.rl.runs.training import train as train_parts
+from morphgen.splits.split import Side
+from morphgen.splits.split_file import read_split
+from morphgen.tasks.goals.split_goals import has_goals, read_split_goals
+from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.registry import (
+    DEFAULT_SIMULATOR,
+    SIMULATORS,
+    TASKS,
+    CollisionGeometry,
+    batch_device,
+    require_simulator_device,
+)
+from morphgen.tasks.scenes.env_specs import GoalConfig, load_robot
+from morphgen.tasks.task import TaskConfig
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """A run of training, which ended or was stopped."""
+
+    folder: Path
+    """Folder of the run; ``morphgen.evaluate`` and ``load_policy`` take it."""
+    config: RunConfig = field(repr=False)
+    """All that determines the weights."""
+    parts: tuple[Subrun, ...] = field(repr=False)
+    """The run, or a part for each robot; none in processes of ``torchrun`` but the first."""
+
+    @property
+    def checkpoints(self) -> tuple[Path, ...]:
+        """Checkpoints that the run has so far."""
+        files = (part.folder / CHECKPOINT for part in self.parts)
+        return tuple(file for file in files if file.is_file())
+
+    @property
+    def unfinished(self) -> int:
+        """Number of parts that continue with ``resume``."""
+        return sum(not is_done(part) for part in self.parts)
+
+    def __str__(self) -> str:
+        """Return the paths of the checkpoints, a line each."""
+        return "\n".join(map(str, self.checkpoints))
+
+
+@checked_signature
+def train(
+    robots: str | PathLike[str],
+    *,
+    agent: str = "me-graph",
+    preset: str | None = None,
+    steps: int | None = None,
+    envs: int | None = None,
+    sim: str | None = None,
+    workers: int = 1,
+    device: str = "cpu",
+    seed: int = 0,
+    out: str | PathLike[str] | None = None,
+    resume: bool = False,
+    minutes: int | None = None,
+    on: Side = "train",
+    obstacles: bool = False,
+    drawn: str | None = None,
+    robot_seed: int | None = None,
+    held_out: Sequence[str | Path] = (),
+    slice_updates: int | None = None,
+    constants: Mapping[str, float] | Sequence[str] = (),
+    tensorboard: bool = True,
+    wandb: bool = False,
+    goal_seed: int | None = None,
+    goal: str | None = None,
+    train_goals: int | None = None,
+    whole: bool = False,
+    max_links: int | None = None,
+    geometry: CollisionGeometry = "primitive",
+    bf16: bool = False,
+    compile: bool = False,
+    library: LibraryFolders = (),
+    show: Callable[[Subrun], ShowMetrics] | None = None,
+) -> TrainingRun:
+    """Train an agent by PPO on the robots of a split, or on one robot.
+
+    Ctrl-C stops after the running update, with a checkpoint; ``resume`` continues from there.
+
+    Examples:
+        >>> small = {"num_steps": 16, "minibatches": 2}
+        >>> run = morphgen.train("prims task=reach", steps=256, envs=8, constants=small)
+        >>> print(run)
+        runs/prims-reach/me-graph/seed0/checkpoint.pt
+        >>> (score,) = morphgen.evaluate(run.folder, episodes=2).scores["deterministic"]
+        >>> score.robot, score.episodes
+        ('prims', 2)
+
+    Args:
+        robots: Name of a split, its file or built folder; or a robot and its task, such as
+            ``arm=ur5 ee=stick task=reach``; or with ``drawn`` the task alone, ``task=reach``.
+        agent: ``se``, ``me-mlp``, ``me-tf`` or ``me-graph``, with switches that are on (+) or
+            off (-) and channels of observations: ``me-tf-symlog+task-reweighting+ik``.
+        preset: Constants and switches to begin with: ``fast`` or ``paper``; by default the agent's.
+        steps: Number of control steps of all environments together; by default the preset's.
+        envs: Number of environments, which the robots share; by default the preset's.
+        sim: Name of the simulator, by default ``mujoco``.
+        workers: Number of processes of PyBullet, or of threads of MuJoCo.
+        device: Device of the networks: ``cpu`` or ``cuda``.
+        seed: Seed of weights, actions and episodes.
+        out: Folder of the run, by default ``runs/SPLIT/AGENT/seedN``.
+        resume: Whether to continue the run in the folder.
+        minutes: Stop with a checkpoint after the update in which so many minutes are over.
+        on: Side of the split, ``train`` or ``test``.
+        obstacles: Whether one robot is among obstacles.
+        drawn: Numbers of robots to draw from grammars, such as ``arm3:300,chain:300``.
+        robot_seed: Seed of the drawn robots, by default 0.
+        held_out: Splits whose test robots are never drawn, besides those of morphgen.
+        slice_updates: Number of updates after which the next of the drawn robots take the
+            environments, if there are fewer of these; by default those of two episodes.
+        constants: Hyperparameters, such as ``{"learning_rate": 1e-4}``, or ``NAME=VALUE`` texts.
+        tensorboard: Whether to write TensorBoard events.
+        wandb: Whether to also log metrics to Weights & Biases.
+        goal_seed: Seed of all goals; by default as shipped with the split, else 0.
+        goal: Goal of reach: ``position`` (default), within 3 cm, or ``pose``, also 10 degrees.
+        train_goals: Number of goals or starts per robot; by default 100, as in evaluations.
+        whole: Whether ``se`` trains each robot of a split with all steps and environments.
+        max_links: Number of links that observations have room for; by default at least 23.
+        geometry: Collision shapes in training: ``primitive``, or ``convex`` pieces of meshes.
+        bf16: Whether to run the networks in bfloat16.
+        compile: Whether to run networks and losses with ``torch.compile``.
+        library: Folders of your own parts.
+        show: Function that begins to show a part of the run, and returns one that receives the
+            metrics of each update and the number of all updates.
+
+    Returns:
+        The folder of the run, and its checkpoints.
+
+    Raises:
+        TaskError: If an argument is unknown or invalid, or the folder has another run.
+        MorphgenError: If a split or a robot cannot be read, or a robot cannot do the task.
+    """
+    given = SimpleNamespace(**locals())
+    simulator = sim or DEFAULT_SIMULATOR
+    require_simulator_device(simulator, batch_device(simulator, device))
+    spec = parse_agent(agent)
+    if drawn is None:
+        if robot_seed is not None or held_out or slice_updates is not None:
+            raise TaskError("robot_seed, held_out and slice_updates: only with drawn")
+        source: Source = other_side(named_source(given), on)
+    else:
+        source = _source_to_draw(given)
+    config = run_config(source, spec, given)
+    _require_used(config, given)
+    if isinstance(source, GrammarSource):
+        config = _with_drawn_robots(config, source, given)  # which takes minutes
+    # Positions came first and have no suffix.
+    name = _folder_name(source) + "-pose" * (goal == "pose")
+    folder = Path(out) if out is not None else Path("runs") / name / str(spec) / f"seed{seed}"
+    return train_run(folder, config, given)
+
+
+def named_source(given: SimpleNamespace, side: Side = "train") -> SplitSource | OneRobot:
+    """Return the robots that a split, or the words of a robot and ``task=NAME``, describe."""
+    text, folders = str(given.robots), library_folders(given.library)
+    words = [text] if Path(text).exists() else text.split() or [text]
+    tasks = [word.removeprefix("task=") for word in words if word.startswith("task=")]
+    robot = " ".join(word for word in words if not word.startswith("task="))
+    if tasks:
+        if len(tasks) > 1 or not robot:
+            raise TaskError(f"{text}: name a robot and one task, {_task_choices()}")
+        TASKS[tasks[0]]  # raises if the task is unknown
+        return robot_source(
+            robot,
+            tasks[0],
+            obstacles=given.obstacles,
+            goal_seed=given.goal_seed or 0,
+            library=folders,
+        )
+    if len(words) > 1 or "=" in text:
+        raise TaskError(f"{text}: a robot needs its task, {_task_choices()}")
+    if given.obstacles:
+        raise TaskError("--obstacles is for one robot; a split says which robots have obstacles")
+    try:
+        return split_side(text, side, given.goal_seed, folders)
+    except BenchmarkError as error:
+        if Path(text).exists():
+            raise
+        raise BenchmarkError(f"{error}; a robot needs {_task_choices()}") from error
+
+
+def _task_choices() -> str:
+    """Return the words that name a task, for messages."""
+    return " or ".join(f"task={name}" for name in TASKS)
+
+
+def split_side(
+    split: str | PathLike[str], side: Side, goal_seed: int | None, library: Sequence[Path]
+) -> SplitSource:
+    """Return a side of a split, with the goals that its folder ships."""
+    definition, folder = read_split_or_folder(split)
+    goals = folder if folder is not None and has_goals(folder) else None
+    seed = goal_seed or 0
+    if goals is not None:
+        shipped = read_split_goals(goals).config.seed
+        if goal_seed not in (None, shipped):
+            raise TaskError(f"--goal-seed {seed}: the goals in {goals} are of seed {shipped}")
+        seed = shipped
+    folders = tuple(library)
+    return split_source(definition, side=side, goal_seed=seed, goals=goals, library=folders)
+
+
+def _source_to_draw(given: SimpleNamespace) -> GrammarSource:
+    """Return the source of the drawn robots of ``train``; none of them is drawn yet."""
+    words, task = str(given.robots), str(given.robots).partition(" ")[0].removeprefix("task=")
+    if words != f"task={task}":
+        raise TaskError(
+            f"{words}: with --robots, name the task and nothing else: {_task_choices()}"
+        )
+    if given.on != "train":
+        raise TaskError(f"--on {given.on}: drawn robots have no sides; --on goes with a split")
+    TASKS[task]  # raises if the task is unknown
+    return drawn_source(
+        given.drawn,
+        task,
+        seed=given.robot_seed or 0,
+        held_out=given.held_out,
+        obstacles=given.obstacles,
+        goal_seed=given.goal_seed or 0,
+        library=library_folders(given.library),
+    )
+
+
+def run_config(source: Source, spec: AgentSpec, given: SimpleNamespace) -> RunConfig:
+    """Return the configuration of a run from arguments of ``train``."""
+    preset = preset_of(given.preset, spec.agent)
+    changes = {**preset.constants, **read_constants(given.constants)}
+    changes |= {"bf16": given.bf16, "compile": given.compile}
+    spec = replace(spec, switches={**preset.switches, **spec.switches})
+    steps = given.steps or preset.total_timesteps
+    policy, ppo = configs_of(spec, tasks_of(source), changes, steps)
+    return RunConfig(
+        source,
+        policy,
+        ppo,
+        seed=given.seed,
+        sim=given.sim or DEFAULT_SIMULATOR,
+        geometry=given.geometry,
+        num_envs=given.envs or preset.num_envs,
+        device=given.device,
+        full_budget=given.whole and AGENTS[spec.agent].per_robot,
+        max_links=given.max_links or _max_links(source),
+        tasks=_task_configs(source, given.goal, given.train_goals),
+    )
+
+
+def read_constants(constants: Mapping[str, float] | Sequence[str]) -> dict[str, Any]:
+    """Return hyperparameters whose names and types are valid."""
+    if isinstance(constants, Mapping):
+        constants = [f"{name}={value}" for name, value in constants.items()]
+    return parse_constants(constants)
+
+
+def _max_links(source: Source) -> int:
+    """Return the number of links that observations are padded to by default.
+
+    For a split it is the split's number. For drawn robots, of which the largest is not known yet,
+    it is the benchmark's. For one robot it is the benchmark's, or the number of the
+    robot's links if these are more, as for a robot with two arms.
+    """
+    if isinstance(source, SplitSource):
+        return split_of(source).max_links
+    if isinstance(source, GrammarSource):
+        return default_max_links([])
+    robot = load_robot(source.name, library=map(Path, source.library))
+    return default_max_links([len(robot.links)])
+
+
+def _task_configs(
+    source: Source, goal: str | None, num_goals: int | None
+) -> tuple[TaskConfig, ...]:
+    """Return the configurations of the tasks with a goal of reach and a number of goals."""
+    tasks = tasks_of(source)
+    names = dict.fromkeys((*TASKS.builtin, *tasks))
+    configs = with_goal((TASKS[name].config_type() for name in names), goal, tasks)
+    if num_goals is None:
+        return configs
+    if isinstance(source, SplitSource) and source.goal_dir:
+        raise TaskError(
+            f"--train-goals {num_goals}: {source.goal_dir} ships the goals to train on; name the "
+            f"split itself, {source.name}, to have others"
+        )
+    return tuple(replace(config, num_goals=num_goals) for config in configs)
+
+
+def with_goal(
+    configs: Iterable[TaskConfig], goal: str | None, tasks: Iterable[str]
+) -> tuple[TaskConfig, ...]:
+    """Return configs of tasks with a goal of reach, of ``GOAL_KINDS``; None keeps it."""
+    if goal is None:
+        return tuple(configs)
+    if ReachConfig.task not in (names := tuple(dict.fromkeys(tasks))):
+        raise TaskError(
+            f"--goal {goal} is for task {ReachConfig.task}; the tasks of the robots: "
+            f"{' and '.join(names)}"
+        )
+    return tuple(
+        replace(config, goal=goal) if isinstance(config, ReachConfig) else config
+        for config in configs
+    )
+
+
+def _require_used(config: RunConfig, given: SimpleNamespace) -> None:
+    """Require that the agent uses all arguments of ``train`` that were given.
+
+    A study does not require it: its options may be for some of its agents.
+    """
+    agent, changed = config.policy.agent, read_constants(given.constants)
+    if given.whole and not AGENTS[agent].per_robot:
+        valid = " or ".join(name for name in AGENTS if AGENTS[name].per_robot)
+        raise TaskError(f"--whole is for --agent {valid}, not for {agent}")
+    for name in changed:
+        owners = owners_of(name)
+        if agent not in owners:
+            raise TaskError(f"--set {name}: {agent} has none; valid for {' and '.join(owners)}")
+    if "logit_scale" in changed and not config.policy.discrete:
+        raise TaskError(
+            "--set logit_scale: continuous actions have no logits; it is for --discrete"
+        )
+
+
+def _with_drawn_robots(
+    config: RunConfig, source: GrammarSource, given: SimpleNamespace
+) -> RunConfig:
+    """Draw the robots of a run, after all that can be checked before; return its configuration."""
+    if given.slice_updates is not None and num_slices(config) == 1:
+        raise TaskError(
+            f"--slice-updates {given.slice_updates}: {source.name} has an environment for "
+            "every robot at all times"
+        )
+    slice_updates = given.slice_updates or default_slice_updates(config)
+    config = replace(config, slice_updates=slice_updates)
+    require_runnable(config)
+    robots = draw(source, GoalConfig(tasks=config.tasks), jobs=given.workers)
+    if robots.skipped:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in robots.skipped.items())
+        note(f"morphgen: robots that were skipped: {reasons}")
+    held_out = (read_split(name).max_links for name in source.held_out)
+    max_links = given.max_links or default_max_links([robots.most_links, *held_out])
+    require_max_links(robots.most_links, "the largest of the drawn robots", max_links)
+    drawn = replace(source, drawn_hash=robots.hash)
+    return replace(config, source=drawn, max_links=max_links)
+
+
+def _folder_name(source: Source) -> str:
+    """Return the name of the folder of a run's robots."""
+    if isinstance(source, SplitSource):
+        name = source.name + "-test" * (source.side == "test")
+    else:
+        name = f"{Path(source.name).name}-{source.task}" + "-obstacles" * source.obstacles
+    return re.sub(r"[^\w./-]+", "-", name).strip("/.")
+
+
+def train_run(folder: Path, config: RunConfig, given: SimpleNamespace) -> TrainingRun:
+    """Say what is trained, and train to the end of the run, or until it is stopped."""
+    workers = given.workers
+    if isinstance(config.source, GrammarSource) and not SIMULATORS[config.sim].takes_workers:
+        workers = 1  # the others have drawn the robots
+    parts = train_parts(
+        folder,
+        config,
+        resume=given.resume,
+        execution=ExecutionConfig(workers, given.tensorboard, given.wandb, given.minutes),
+        show=given.show,
+        begin=lambda: note(_described(folder, config)),
+    )
+    return TrainingRun(folder, config, tuple(parts))
+
+
+def _described(folder: Path, config: RunConfig) -> str:
+    """Return in a line what a run trains on what, and where."""
+    source, ppo = config.source, config.ppo
+    number = len(members(source)) or num_drawn(source) or 1
+    robots = "1 robot" if number == 1 else f"{number} robots"
+    return (
+        f"training {config.policy.agent} at {', '.join(tasks_of(source))} on {source.name} "
+        f"({robots}): {ppo.total_timesteps:,} steps in {config.num_envs} environments of "
+        f"{config.sim}, networks on {config.device}; folder {folder}"
+    )
