@@ -23,8 +23,9 @@ from morphgen.model.findings import Finding
 
 _LOCATION = re.compile(r",? line \d+, column \d+.*$", re.DOTALL)
 _ENCODING = re.compile(rb"""<\?xml[^>]{0,200}?encoding\s*=\s*["']([\w.:-]{1,40})["']""")
-_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
-_INSTRUCTION = re.compile(r"<\?.*?\?>", re.DOTALL)
+# Those without an end match up to that of the text, or the search would take quadratic time.
+_COMMENT = re.compile(r"<!--.*?(-->|\Z)", re.DOTALL)
+_INSTRUCTION = re.compile(r"<\?.*?(\?>|\Z)", re.DOTALL)
 _SOUND_DECLARATION = re.compile(r"""\A<\?xml\s[^>]*?version\s*=\s*["']1\.[0-9]+["']""")
 _ROOT = re.compile(r"<([^\W\d][^\s<>/]*)")
 _INVALID = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -82,6 +83,8 @@ def parse_description(data: bytes, origin: str) -> tuple[etree._Element, tuple[F
         text, findings = _repaired(data, origin)
         if "<!DOCTYPE" in text.upper():
             raise _doctype_error(origin) from None
+        if "<!--" in text or "<?" in text:  # without an end; libxml2 takes quadratic time
+            raise
         root, more = _recovered(text, origin)
         if root is None:
             raise
@@ -114,8 +117,8 @@ def _decoded(data: bytes) -> tuple[str, str, str]:
 
 
 def _blank(match: re.Match[str]) -> str:
-    """Return a text of as many lines."""
-    return "\n" * match[0].count("\n")
+    """Return a text of as many lines; what has no end stays."""
+    return "\n" * match[0].count("\n") if match[1] else match[0]
 
 
 def _is_invalid_comment(comment: re.Match[str]) -> bool:
@@ -131,7 +134,7 @@ _BARE = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#[1-9][0-9]{0,5}|#x[1-9A-Fa-f][0
 _REPLACEMENTS: dict[re.Pattern[str], tuple[Any, Callable[[re.Match[str]], bool], str, str]] = {
     _COMMENT: (_blank, _is_invalid_comment, "comments with '--' or bad characters", "left out"),
     _INSTRUCTION: (_blank, _is_invalid_declaration, "a declaration not of XML 1", "left out"),
-    re.compile(r"\A\s*[^<\s][^<]*"): (_blank, bool, "text before the root element", "left out"),
+    re.compile(r"\A\s*([^<\s][^<]*)"): (_blank, bool, "text before the root element", "left out"),
     _BARE: ("&amp;", bool, "a bare '&'", "kept"),
     _INVALID: ("\ufffd", bool, "a character that XML does not allow", "read as U+FFFD"),
 }

@@ -179,6 +179,8 @@ def test_repairs_of_a_kind_are_one_finding_with_a_count():
         described(b"<a></b>"),
         described()[:-8],
         described(b"<!-- a"),
+        described(b"<!--" * 2**18),  # in hours, if each is searched for an end
+        described(b"<? " * 2**18),
         described(b"<![CDATA[ a"),
         b"<!-- a -- b -->",
     ],
