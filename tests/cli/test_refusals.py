@@ -25,6 +25,7 @@ from morphgen.cli.export import FILES
 from morphgen.errors import MorphgenError
 from morphgen.formats import bundle
 from morphgen.splits.split_file import split_text
+from morphgen.tasks.registry import TASKS
 
 ABBREVIATIONS = {
     "CUBES": "split new interpolation --grammar cubes --train 3",
@@ -202,7 +203,7 @@ train --envs x => argument --envs: x: expected a whole number, 1 or more; see mo
 train interpolation/arm3/reech => did you mean 'interpolation/arm3/reach'?
 train planar-cube => a robot needs task=reach or task=push
 train base=planar ee=cube => a robot needs its task
-train planar-cube task=lift => unknown task 'lift'; valid: push, reach
+train planar-cube task=dance => unknown task 'dance'; valid: TASKS
 train interpolation/arm3/reach --obstacles => --obstacles is for one robot
 train interpolation/arm3/reach --envs 9 => fewer than the 10 robots
 RUN --agent me-tff => did you mean 'me-tf'?
@@ -270,7 +271,7 @@ STUDY --eval-steps 4000000 => 13334 episodes
 study small.yaml again.yaml => again.yaml: split 'mine/small' is also in small.yaml; expected sp
 split score a.json --split some.yaml => a.json: no submission
 split score b.json --split some.yaml => b.json: no such file
-play lift prims => see morphgen play --help
+play dance prims => see morphgen play --help
 play push => see morphgen play --help
 play push prims --policy magic => 'magic' is neither a checkpoint nor a policy; valid:
 play push prism => did you mean 'prims'?
@@ -283,7 +284,7 @@ speed reach arm3 --seconds 0 => argument --seconds: 0: expected a number above 0
 speed reach arm3 --sim mujoco --device cuda => device 'cuda'
 speed reach ur55-plane => 'ur55' is not a part
 speed push prims --sim kinematic => has no contacts, and push of 'prims' has a block
-zeroshot ur5-stick --task pull => unknown task 'pull'
+zeroshot ur5-stick --task dance => unknown task 'dance'
 zeroshot ur5-stick --task push --obstacles => no policy for push among obstacles comes with
 zeroshot ur5-stick --task push --goal pose => --goal pose is for task reach
 zeroshot ur5-stick --task push --policy zero-shot => was trained on reach, not on push
@@ -300,7 +301,7 @@ view --library nowhere => library folder
 view --allow-origin null => --allow-origin 'null': expected a site
 view --allow-origin http://box/page => without a path
 """
-"""Command lines that are refused, and part of the reason."""
+"""Command lines that are refused, and part of the reason; TASKS stands for the names of tasks."""
 
 
 @cache
@@ -342,7 +343,7 @@ def _inputs():
 @pytest.mark.usefixtures("_inputs", "own_cache", "nothing_is_stored")
 @pytest.mark.parametrize("refusal", REFUSALS.strip().splitlines())
 def test_invalid_arguments_are_refused_in_one_line(refused, refusal):
-    line, _, reason = refusal.partition(" => ")
+    line, _, reason = refusal.replace("TASKS", ", ".join(sorted(TASKS))).partition(" => ")
     first, *words = shlex.split(line)
     assert reason in refused(*shlex.split(ABBREVIATIONS.get(first, first)), *words)
 
