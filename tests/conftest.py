@@ -1,6 +1,7 @@
 """Settings of hypothesis, fixtures of several rooms, and the end of a test session."""
 
 import gc
+import sys
 from dataclasses import replace
 
 import pytest
@@ -36,6 +37,20 @@ def robot_urdf(tmp_path):
         return path
 
     return write
+
+
+@pytest.fixture
+def xacro_here(monkeypatch):
+    """Expand xacro files of users in this process; the limits of its own have other tests."""
+    for module in ("compile", "expand"):
+        monkeypatch.setattr(
+            f"morphgen.formats.xacro.{module}.run_in_child",
+            lambda task, path, finder, **values: task(path, finder, **values),
+        )
+    limit = sys.getrecursionlimit()
+    sys.setrecursionlimit(4 * limit)  # as in that process
+    yield
+    sys.setrecursionlimit(limit)
 
 
 @pytest.hookimpl(trylast=True)
