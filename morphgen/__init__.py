@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from morphgen.api.checks import check, conform, fix
     from morphgen.api.environments import make_env
     from morphgen.api.evaluation import evaluate, play
+    from morphgen.api.goals import goals
     from morphgen.api.robots import compose, fit, read, sample, write
     from morphgen.api.splits import split
     from morphgen.api.training import train
@@ -35,6 +36,7 @@ __all__ = [
     "evaluate",
     "fit",
     "fix",
+    "goals",
     "make_env",
     "play",
     "read",
@@ -55,6 +57,7 @@ _MODULES = {
     "evaluate": "morphgen.api.evaluation",
     "fit": "morphgen.api.robots",
     "fix": "morphgen.api.checks",
+    "goals": "morphgen.api.goals",
     "make_env": "morphgen.api.environments",
     "play": "morphgen.api.evaluation",
     "read": "morphgen.api.robots",

@@ -22,6 +22,7 @@ FUNCTIONS = (
     "conform",
     "evaluate",
     "fit",
+    "goals",
     "make_env",
     "play",
     "read",

@@ -11,6 +11,7 @@ from typing import Any, cast
 
 from tabulate import tabulate
 
+from morphgen.api.goals import goals as sample_goals
 from morphgen.api.splits import DEFAULT_TRAIN, NewSplit
 from morphgen.api.splits import split as choose
 from morphgen.benchmark import release as releases
@@ -37,7 +38,7 @@ from morphgen.benchmark.survey import (
     statistics,
 )
 from morphgen.cli import options as opt
-from morphgen.cli.progress import bar, status
+from morphgen.cli.progress import bar
 from morphgen.encoding.similarity import MEASURES, NEAR_THRESHOLDS, NearThresholds
 from morphgen.errors import BenchmarkError, GrammarError, PartError
 from morphgen.formats.files import require_writable_file, write_file
@@ -49,92 +50,23 @@ from morphgen.splits.split_file import read_split, split_names, split_paths, wri
 from morphgen.tasks.goals.split_goals import (
     GoalResult,
     SplitGoals,
-    goal_record,
-    sample_robot_goals,
     sample_split_goals,
 )
-from morphgen.tasks.scenes.env_specs import GoalConfig, load_robot
-
-HEADERS = ("robot", "side", "task", "goals", "acceptance", "obstacles", "certified")
+from morphgen.tasks.scenes.env_specs import GoalConfig
 
 
 def goals(args: argparse.Namespace) -> int:
     """Sample goal sets and print a table with the failures."""
-    if args.task is None:
-        if len(args.words) > 1:
-            raise BenchmarkError(
-                f"{' '.join(args.words)}: name one split, or say --task for a robot"
-            )
-        split, _ = read_split_or_folder(args.words[0])
-        results = make_goals(args, split, GoalConfig(args.seed), certify=args.certify)
-    else:
-        results = [_robot_goals(args, GoalConfig(args.seed))]
-    passed = all(result.goals is not None and not result.certificate_errors for result in results)
-    data = _data(results, args.seed) | {"passed": passed}
-    opt.print_result(args, data, lambda: _goals_text(results, args.seed))
-    return int(not passed)
+    with bar(args, "sampling goals"):
+        sets = sample_goals(" ".join(args.words), **opt.arguments(args, sample_goals))
+    opt.print_result(args, sets.as_dict(), lambda: str(sets))
+    return int(not sets.passed)
 
 
-def _robot_goals(args: argparse.Namespace, config: GoalConfig) -> GoalResult:
-    words = " ".join(args.words)
-    if words in split_names():
-        raise BenchmarkError(f"--task {args.task}: is for a robot; {words} is a split")
-    with status(args, f"sampling goals of {args.task} for {words}"):
-        robot = load_robot(words, library=args.library)
-        return sample_robot_goals(
-            robot, args.task, config, obstacles=args.obstacles, certified=args.certify
-        )
-
-
-def make_goals(
-    args: argparse.Namespace, split: Split, config: GoalConfig, *, certify: bool = False
-) -> list[GoalResult]:
+def make_goals(args: argparse.Namespace, split: Split, config: GoalConfig) -> list[GoalResult]:
     """Sample the goal sets of a split's robots, or read them from the cache."""
     with bar(args, "sampling goals"):
-        return sample_split_goals(
-            split, opt.library_of(args), config, jobs=args.jobs, certified=certify
-        )
-
-
-def _goals_text(results: Sequence[GoalResult], seed: int) -> str:
-    lines = [tabulate([_goals_row(result) for result in results], HEADERS, disable_numparse=True)]
-    for result in results:
-        robot = f"{result.side} robot {result.robot}" if result.side else f"robot {result.robot}"
-        if result.goals is None:
-            lines.append(f"{robot}: {result.error}")
-        elif result.certificate_errors:
-            first, *others = result.certificate_errors
-            more = f" (and {len(others)} more)" if others else ""
-            lines.append(f"{robot}: {first}{more}")
-    complete = sum(result.goals is not None for result in results)
-    return "\n".join([*lines, f"{complete} of {len(results)} goal sets are complete, seed {seed}"])
-
-
-def _goals_row(result: GoalResult) -> tuple[str, ...]:
-    goals, certificate_errors = result.goals, result.certificate_errors
-    certified = (
-        "not tested" if certificate_errors is None else "NO" if certificate_errors else "yes"
-    )
-    rate = "" if result.acceptance is None else f"{result.acceptance:.3g}"
-    count = "none" if goals is None else str(len(goals.q))
-    boxes = str(len(goals.obstacles)) if goals else "yes" if result.obstacles else "0"
-    return (result.robot, result.side or "", result.task, count, rate, boxes, certified)
-
-
-def _data(results: Sequence[GoalResult], seed: int) -> dict[str, object]:
-    sets = []
-    for result in results:
-        if result.goals:
-            errors = result.certificate_errors
-            certified = None if errors is None else not errors
-            unproven = list(errors or ())
-            sets.append({**goal_record(result), "certified": certified, "unproven": unproven})
-    failures = [
-        {"robot": result.robot, "side": result.side, "task": result.task, "why": result.error}
-        for result in results
-        if result.goals is None
-    ]
-    return {"seed": seed, "sets": sets, "failures": failures}
+        return sample_split_goals(split, opt.library_of(args), config, jobs=args.jobs)
 
 
 MAX_LISTED = 10

@@ -15,6 +15,7 @@ ROBOTS = {"words": "robots"}
 OPERATIONS = {
     "conform": ("conform", ROBOT, {"root", "json"}),
     "eval": ("evaluate", ROBOTS | {"checkpoint": "policy"}, {"out", "json"}),
+    "goals": ("goals", ROBOTS, {"json"}),
     "play": ("play", ROBOT, set()),
     "train": ("train", ROBOTS, {*SWITCHES, "observe"}),
 }
