@@ -48,11 +48,12 @@ def main() -> int:
         robot = compose_member(member, library)
         robots_features.append(features(robot, token_shapes(robot, library.folders)))
     names = [robot.name for robot in robots_features]
+    categories = [member.category for member in members.values()]
     values = similarity_matrix(robots_features, args.measure)
     title = f"{args.measure}: {MEASURES[args.measure].meaning}"
     args.out.mkdir(parents=True, exist_ok=True)
     points = classical_mds(to_distances(values, args.measure))
-    (args.out / "map.png").write_bytes(map_png(names, [MapPanel(title, points)]))
+    (args.out / "map.png").write_bytes(map_png(names, [MapPanel(title, points)], categories))
     print(f"{len(names)} robots: {args.out}/map.png")
     return 0
 

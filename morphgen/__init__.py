@@ -69,9 +69,6 @@ _MODULES = {
     "write": "morphgen.api.robots",
 }
 """Module of each public name."""
-_UNLISTED = ("MorphgenError", "Robot", "fix")
-"""Public names that ``dir`` leaves out: a user meets them through the functions, in an ``except``,
-an annotation or a finding that says it can be repaired."""
 
 if not TYPE_CHECKING:  # to type checkers, a name that is not imported above is an error
 
@@ -92,7 +89,7 @@ if not TYPE_CHECKING:  # to type checkers, a name that is not imported above is 
             )
 
     def __dir__() -> list[str]:
-        return [name for name in __all__ if name not in _UNLISTED]
+        return list(__all__)
 
 
 if "gymnasium" in _sys.modules:

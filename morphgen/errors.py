@@ -90,8 +90,13 @@ def shortened(text: str, most: int = 80) -> str:
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
-def nearest(name: str, valid: Iterable[str]) -> str:
+def nearest(name: str, valid: Iterable[str], unlisted: Iterable[str] = ()) -> str:
     """Return a hint for an unknown name: the closest valid one and the list, if not too long.
+
+    Args:
+        name: The unknown name.
+        valid: Valid names.
+        unlisted: Further valid names, which may be the closest one but are too many for the list.
 
     Returns:
         Text to append to an error, such as ``; did you mean 'ur5'? valid: ur3, ur5``.
@@ -99,8 +104,9 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     choices = sorted(valid)
     if len(name) > _MAX_COMPARED:
         return f"; {len(choices)} are valid"
-    close = [choice for choice in choices if choice.lower() == name.lower()]
-    close = close or difflib.get_close_matches(name, choices, n=1, cutoff=0.5)
+    every = [*choices, *sorted(unlisted)]
+    close = [choice for choice in every if choice.lower() == name.lower()]
+    close = close or difflib.get_close_matches(name, every, n=1, cutoff=0.5)
     guess = f"; did you mean {close[0]!r}?" if close else ";"
     if len(choices) > _MAX_LISTED:
         listed = sorted(difflib.get_close_matches(name, choices, n=8, cutoff=0.0))  # however unlike

@@ -16,12 +16,12 @@ import numpy as np
 import scipy  # loads its packages at their first use, which take seconds
 from msgspec import Meta
 from numpy.typing import ArrayLike, NDArray
-from tabulate import tabulate
 
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.formats.files import require_writable_file, write_file
 from morphgen.formats.records import FiniteNumber, Record
 from morphgen.splits.split import Side
+from morphgen.tables import table
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
 
@@ -299,7 +299,7 @@ Scores = Mapping[str, Sequence[Score]]  # scores by mode, or by the name of a ba
 def score_table(scores_by_mode: Scores, style: str = "simple") -> str:
     """Return a table with a line per robot and mode; ``style`` is one of tabulate's."""
     rows = [_row(mode, each) for mode, scores in scores_by_mode.items() for each in scores]
-    return tabulate(rows, HEADERS, tablefmt=style, disable_numparse=True)
+    return table(rows, HEADERS, style=style)
 
 
 def summary(scores_by_mode: Scores) -> str:

@@ -27,6 +27,7 @@ PACKAGES = (
     "typing",
     "progress",
     "processes",
+    "tables",
     "model",
     "formats",
     "checks",

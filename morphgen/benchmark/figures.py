@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -32,6 +32,11 @@ _MIN_SIDE, _UNNAMED_SIDE = 3.2, 8.0
 """Smallest side of a heatmap, and side of one without names [inches]."""
 _LABEL_DISTANCES = (9, 16, 26, 40, 58, 80)
 """Distances of a name from its point, tried in turn [pixels]."""
+_MARKERS = "o^"
+"""Markers of groups of robots: each with all colours, one after another."""
+_ALL_NAMED, _SOME_NAMED, _APART = 20, 30, 16.0
+"""Largest number of robots of a map that are all named; of more, number of names, and least
+distance of points that are named [pixels]."""
 _LABEL_FONT_SIZE = 7.5  # font size of the names in a map [points]
 _LABEL_DIRECTIONS = np.array(
     [(1, 0), (-1, 0), (0, 1), (0, -1), (0.8, 0.7), (-0.8, 0.7), (0.8, -0.7), (-0.8, -0.7)]
@@ -88,31 +93,35 @@ def heatmap_png(names: Sequence[str], panels: Sequence[Panel]) -> bytes:
 
 
 @_default_style()
-def map_png(names: Sequence[str], panels: Sequence[MapPanel]) -> bytes:
+def map_png(names: Sequence[str], panels: Sequence[MapPanel], groups: Sequence[str]) -> bytes:
     """Draw maps side by side and return the PNG.
 
-    Colours distinguish families: robots whose names differ only in the number at their end. Up to
-    ``MAX_NAMED`` robots are named where there is room.
+    Colours and markers distinguish the largest groups of robots, which the legend names. Robots are
+    named where there is room; of many robots, some that are spread over the map.
     """
-    figure = Figure(figsize=(7.5 * len(panels), 7), dpi=_DPI, layout="constrained")
+    legend_width = 0.9 + 0.8 * _LETTER_WIDTH * max(map(len, groups))
+    size = (7.0 * len(panels) + legend_width, 7)
+    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
-    stems = [re.sub(r"-\d+$", "", name) for name in names]
-    families = [stem if stems.count(stem) > 1 else "" for stem in stems]
     for panel, ax in zip(panels, axes, strict=True):
-        ax.set_title(f"{panel.title}\n{panel.map.kept:.0%} of the variation shown", fontsize=10)
+        first, second = panel.map.shares
+        ax.set_title(panel.title, fontsize=10)
+        ax.set_xlabel(f"first dimension of the distances, {first:.0%} of their variation")
+        ax.set_ylabel(f"second dimension, {second:.0%}")
         ax.set_aspect("equal", "datalim")
         ax.margins(0.12)
         ax.grid(color="0.92")
         ax.set_axisbelow(True)
-        _scatter(ax, panel.map.points, families)
-    if len(set(families)) > 1:
-        axes[-1].legend(fontsize=8, loc="best")
+        _scatter(ax, panel.map.points, groups)
+    handles, labels = axes[0].get_legend_handles_labels()
+    legend = figure.legend(handles, labels, fontsize=8, loc="outside right upper")
+    for text in legend.get_texts():
+        text.set_parse_math(False)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
-    if len(names) <= MAX_NAMED:
-        for panel, ax in zip(panels, axes, strict=True):
-            _name_points(ax, panel.map.points, names, canvas)
+    for panel, ax in zip(panels, axes, strict=True):
+        _name_points(ax, panel.map.points, names, canvas)
     return _png(figure)
 
 
@@ -146,17 +155,27 @@ def _write_values(ax: Axes, panel: Panel, low: float, high: float) -> None:
         ax.text(column, row, text, ha="center", va="center", color=colour, fontsize=5.5)
 
 
-def _scatter(ax: Axes, points: Array, families: Sequence[str]) -> None:
-    """Draw the points with a colour and marker per family; grey for robots without a family."""
+def _scatter(ax: Axes, points: Array, groups: Sequence[str]) -> None:
+    """Draw the points with a colour and marker for each of the largest groups, grey for others."""
     colours = [colour for i, colour in enumerate(matplotlib.color_sequences["tab10"]) if i != 7]
-    for i, family in enumerate(sorted(set(families) - {""})):
-        members = [other == family for other in families]
-        marker = "os^Dvph"[i // len(colours) % 7]
-        x, y = points[members].T
-        ax.scatter(x, y, s=28, color=colours[i % len(colours)], marker=marker, label=family)
-    x, y = points[[family == "" for family in families]].T
-    if len(x):
-        ax.scatter(x, y, s=28, color="0.4", label="others")
+    styles = [(colour, marker) for marker in _MARKERS for colour in colours]
+    sizes = Counter(sorted(groups)).most_common()  # of equal size in the order of their names
+    named = sizes if len(sizes) <= len(styles) else sizes[: len(styles)]
+    left = len(sizes) - len(named)
+    if left:
+        members = [group not in dict(named) for group in groups]
+        label = f"{left} smaller groups ({sum(members)})"
+        _draw_points(ax, points[members], "0.6", ".", label)
+    for (group, count), (colour, marker) in zip(named, styles, strict=False):
+        members = [other == group for other in groups]
+        _draw_points(ax, points[members], colour, marker, f"{group} ({count})")
+
+
+def _draw_points(ax: Axes, points: Array, colour: object, marker: str, label: str) -> None:
+    x, y = points.T
+    ax.scatter(
+        x, y, s=32, color=colour, marker=marker, label=label, edgecolors="white", linewidths=0.4
+    )
 
 
 def _name_points(ax: Axes, points: Array, names: Sequence[str], canvas: FigureCanvasAgg) -> None:
@@ -165,10 +184,8 @@ def _name_points(ax: Axes, points: Array, names: Sequence[str], canvas: FigureCa
     font = FontProperties(size=_LABEL_FONT_SIZE)
     centres = ax.transData.transform(points)
     taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in centres]
-    legend = ax.get_legend()
-    if legend is not None:
-        taken.append(legend.get_window_extent(renderer))
-    for point, centre, name in zip(points, centres, names, strict=True):
+    for i in range(len(names)) if len(names) <= _ALL_NAMED else _spread(centres):
+        point, centre, name = points[i], centres[i], names[i]
         width, height, _ = renderer.get_text_width_height_descent(name, font, ismath=False)
         position = _free_position(centre, (width, height), taken, ax.bbox)
         if position is None:
@@ -186,6 +203,18 @@ def _name_points(ax: Axes, points: Array, names: Sequence[str], canvas: FigureCa
             parse_math=False,
             arrowprops={"arrowstyle": "-", "color": "0.6", "linewidth": 0.5, "shrinkB": 3},
         )
+
+
+def _spread(points: Array) -> Iterator[int]:
+    """Yield indices of points, each of which is the farthest from those before it [pixels]."""
+    chosen = int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())
+    distance = np.full(len(points), np.inf)
+    for _ in range(_SOME_NAMED):
+        yield chosen
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen], axis=1))
+        chosen = int(distance.argmax())
+        if distance[chosen] < _APART:
+            return
 
 
 def _free_position(

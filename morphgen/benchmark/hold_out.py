@@ -34,6 +34,7 @@ from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import PART_KINDS, Manifest, Parameter, parse_value
+from morphgen.grammar.request import dotted_keys
 from morphgen.model.findings import Finding
 from morphgen.processes import parallel_map
 from morphgen.progress import part_of
@@ -166,10 +167,9 @@ def _condition(term: str, text: str, library: Library, origin: str) -> _Conditio
         return condition
     if dot:
         return _range(owner, name, value, library, where)
-    keys = [*PART_KINDS, MANUFACTURER]
-    raise BenchmarkError(
-        f"{where}: unknown key {key!r}{nearest(key, keys)}, or PART.PARAMETER=LOW..HIGH"
-    )
+    parameters = dotted_keys((manifest.name, manifest) for manifest in library.manifests())
+    hint = nearest(key, [*PART_KINDS, MANUFACTURER], parameters)
+    raise BenchmarkError(f"{where}: unknown key {key!r}{hint}, or PART.PARAMETER=LOW..HIGH")
 
 
 def _range(owner: str, name: str, value: str, library: Library, where: str) -> _Condition:

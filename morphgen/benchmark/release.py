@@ -164,7 +164,11 @@ class Release(Record, frozen=True):
     @property
     def stem(self) -> str:
         """Name of the archive without its suffix, and of the folder in it."""
-        return f"{self.name.replace('/', '-')}-{self.version}"
+        return _stem(self.name, self.version)
+
+
+def _stem(split: str, release_version: str) -> str:
+    return f"{split.replace('/', '-')}-{release_version}"
 
 
 def _is_date(text: str) -> bool:
@@ -460,6 +464,34 @@ class ReleaseReport:
     release: Release
 
 
+@dataclass(frozen=True, eq=False)
+class CheckedRelease:
+    """A split that may be released as requested, with what the checks found out."""
+
+    release: Release
+    parts: tuple[LicencedPart, ...]
+    survey: SplitSurvey
+
+
+def check_release(
+    split: Split, library: Library, request: ReleaseRequest, *, jobs: int = 1
+) -> CheckedRelease:
+    """Require that a split may be released: names, licences of its parts, and audit."""
+    parts = licenced_parts(split, library)
+    require_allowed(split, parts, request.allowed_licences)
+    release = _release(split, request, {})
+    survey = survey_split(split, library, pairs="train", jobs=jobs)
+    audited = audit_survey(survey, library)
+    require_passed(audited)
+    release = _release(split, request, _difficulty_data(survey, audited))
+    return CheckedRelease(release, tuple(parts), survey)
+
+
+def archive_path(out: Path, split: Split, release_version: str) -> Path:
+    """Return the path of the archive of a release in a folder."""
+    return out / f"{_stem(split.name, release_version)}.zip"
+
+
 def release_split(
     split: Split,
     out: Path,
@@ -471,14 +503,9 @@ def release_split(
     jobs: int = 1,
 ) -> ReleaseReport:
     """Write the archive of a release into a folder."""
-    parts = licenced_parts(split, library)
-    require_allowed(split, parts, request.allowed_licences)
-    release = _release(split, request, {})
-    survey = survey_split(split, library, pairs="train", jobs=jobs)
-    audited = audit_survey(survey, library)
-    require_passed(audited)
-    rows = survey_difficulty(survey, results)
-    release = _release(split, request, _difficulty_data(survey, audited))
+    checked = check_release(split, library, request, jobs=jobs)
+    release, parts = checked.release, checked.parts
+    rows = survey_difficulty(checked.survey, results)
     goals: list[GoalResult] = []
     if request.goals:
         goals = sample_split_goals(split, library, request.protocol.goals, jobs=jobs)

@@ -15,7 +15,6 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from tabulate import tabulate
 
 from morphgen.benchmark.texts import read_text
 from morphgen.encoding.robot_hash import robot_hash
@@ -32,6 +31,7 @@ from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map
 from morphgen.progress import part_of
 from morphgen.splits.split import SIDES, Member, Side, Split, sided_members
+from morphgen.tables import table
 from morphgen.typing import Array
 
 
@@ -456,7 +456,8 @@ def difficulty_table(
         *baselines,
     )
     cells = [tuple(_cells(row, baselines)) for row in rows]
-    return tabulate(cells, headers, tablefmt=style, disable_numparse=True)
+    last = [name for name in headers if name.startswith("nearest")]
+    return table(cells, headers, style=style, last=last)
 
 
 def _cells(row: RobotDifficulty, baselines: Sequence[str]) -> Iterator[str]:

@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from tabulate import tabulate
-
 from morphgen import checks
 from morphgen.api.checks import bundle_of, check_source, conform_source
 from morphgen.checks.conformance import ConformanceReport
@@ -20,6 +18,7 @@ from morphgen.formats.urdf.read import UnsoundError
 from morphgen.grammar.library import Library
 from morphgen.grammar.robot_source import RobotReference, read_source
 from morphgen.model.findings import Finding
+from morphgen.tables import table
 
 SEVERITIES = ("error", "warning", "info")
 
@@ -154,7 +153,10 @@ def _conformance_text(reports: Mapping[str, ConformanceReport]) -> str:
                     )
                     notes.append(f"{name}, {where}: {one_line(row.message)}"[:_MAX_NOTE])
                 notes += [f"    cause: {cause}"[:_MAX_NOTE] for cause in row.causes]
-        sections += [_table(rows), "\n".join(notes)]
+        # In the style plain, the titles are not padded to more than 120 columns.
+        lines = [list(row.values()) for row in rows]
+        text = table(lines, ("robot", *columns), style="plain", last=("joint",)) if rows else ""
+        sections += [text, "\n".join(notes)]
     sections.append(
         "\n".join(
             f"{Path(label).name}: at home, links {pair} penetrate by {1000 * depth:.3g} mm"
@@ -163,12 +165,6 @@ def _conformance_text(reports: Mapping[str, ConformanceReport]) -> str:
         )
     )
     return "\n\n".join(filter(None, sections))
-
-
-def _table(rows: Sequence[Mapping[str, str]]) -> str:
-    # As headers, the titles would be padded to more than 120 columns.
-    lines = [list(rows[0]), *(list(row.values()) for row in rows)] if rows else []
-    return tabulate(lines, tablefmt="plain", disable_numparse=True)
 
 
 def _cell(value: str | bool | float | None) -> str:

@@ -6,11 +6,14 @@ A format is one function, a row of ``FILES`` or ``FOLDERS``, and a few words in 
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from morphgen.api.checks import bundle_of
 from morphgen.checks.robot_srdf import (
     MATRIX_SAMPLES,
     collision_matrix,
@@ -21,7 +24,6 @@ from morphgen.cli import options as opt
 from morphgen.errors import FormatError
 from morphgen.fitting.replace_collision import SPHERES, as_spheres, link_spheres
 from morphgen.formats.bundle import (
-    CARD,
     MESHES,
     MJCF,
     URDF,
@@ -30,7 +32,7 @@ from morphgen.formats.bundle import (
     write_fits,
     write_meshes,
 )
-from morphgen.formats.files import write_atomic, writing_export
+from morphgen.formats.files import require_writable_folder, write_atomic, writing_export
 from morphgen.formats.glb import glb_bytes
 from morphgen.formats.mjcf.write import mjcf_text
 from morphgen.formats.ros_package import ros_package_name, write_ros_package
@@ -45,9 +47,10 @@ from morphgen.model.robot import Robot
 
 def export(args: argparse.Namespace) -> int:
     """Write a file or a folder for each robot."""
-    if args.out is not None and not args.out.is_dir():
-        problem = "is no folder" if args.out.exists() else "no such folder; create it first"
-        raise FormatError(f"--out {args.out}: {problem}")
+    made: list[Path] = []
+    if args.out is not None:
+        require_writable_folder(args.out)
+        made = [folder for folder in (args.out, *args.out.parents) if not folder.exists()]
     paths: list[Path] = []
 
     def write(source: RobotReference, library: Library) -> None:
@@ -56,13 +59,20 @@ def export(args: argparse.Namespace) -> int:
         if path in paths:
             raise FormatError(f"{source.label}: {path} is of another robot of this command already")
         if args.format in FILES:
-            write_atomic(path, FILES[args.format](robot, args))
+            content = FILES[args.format](robot, args)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomic(path, content)
         else:
             with writing_export(path, args.format, robot.name) as partial_folder:
                 FOLDERS[args.format](robot, partial_folder, args)
         paths.append(path)
 
-    _, refused = opt.for_each_robot(args, "exporting", write)
+    try:
+        _, refused = opt.for_each_robot(args, "exporting", write)
+    finally:
+        for folder in made if not paths else ():  # the inner ones come first
+            with suppress(OSError):
+                folder.rmdir()
     refusals = [{"robot": label, **error} for label, error in refused.items()]
     data = [*map(str, paths), *refusals]
     opt.print_result(args, data, lambda: "\n".join(map(str, paths)))
@@ -71,13 +81,15 @@ def export(args: argparse.Namespace) -> int:
 
 def _target(source: RobotReference, robot: Robot, args: argparse.Namespace) -> Path:
     """Return the path of a robot's file or folder."""
-    path = bundle_folder(args.out or Path(), robot.name)
+    bundle = bundle_of(source) if args.out is None else None
+    if bundle is not None and args.format in FILES:
+        return bundle / f"robot.{args.format}"
+    beside = Path() if bundle is None else Path(os.path.normpath(bundle / ".."))
+    path = bundle_folder(args.out or beside, robot.name)
     if args.format == "ros2":
         return path.with_name(ros_package_name(robot.name))
     if args.format in FOLDERS:
         return path.with_name(f"{robot.name}-{args.format}")
-    if args.out is None and source.path is not None and (source.path / CARD).is_file():
-        return source.path / f"robot.{args.format}"
     return path.with_name(f"{path.name}.{args.format}")
 
 

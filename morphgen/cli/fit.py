@@ -10,8 +10,6 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import TypeAlias
 
-from tabulate import tabulate
-
 from morphgen.checks import check
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, print_line, status, track
@@ -25,6 +23,7 @@ from morphgen.grammar.part import load_part
 from morphgen.grammar.robot_source import RobotReference, is_robot_file
 from morphgen.model.geometry import MESH_SUFFIXES, Mesh, Shape
 from morphgen.model.robot import Robot
+from morphgen.tables import table
 
 DEFAULT_CONFIGURATIONS = 1000
 COLUMNS = {
@@ -143,7 +142,8 @@ def _fit_robot(
         fit = fit_robot(robot, options, folders, visual=args.visual, jobs=args.jobs)
     report = fit.report
     if not args.json:
-        print(_report_text(report))
+        with opt.fit_terminal(args):
+            print(_report_text(report))
     if folder is None:
         return report.as_dict()
     configurations = args.configurations or DEFAULT_CONFIGURATIONS
@@ -180,12 +180,14 @@ def _agreement_text(primitives: Agreement, hulls: Agreement, n: int) -> str:
         (name, result.accuracy, result.precision, result.recall)
         for name, result in (("primitives", primitives), ("convex hulls of meshes", hulls))
     ]
-    table = tabulate(rows, ("", "agree", "precision", "recall"), floatfmt=".3f")
-    return f"collisions in {n} random configurations, compared with the meshes' triangles:\n{table}"
+    shares = table(rows, ("", "agree", "precision", "recall"), formats=".3f")
+    return (
+        f"collisions in {n} random configurations, compared with the meshes' triangles:\n{shares}"
+    )
 
 
 def _table(rows: list[tuple[object, ...]]) -> str:
-    return tabulate(rows, list(COLUMNS), floatfmt=tuple(COLUMNS.values()))
+    return table(rows, list(COLUMNS), formats=list(COLUMNS.values()))
 
 
 def _row(link: str, fit: LinkFit, same_as: str | None = None) -> tuple[object, ...]:

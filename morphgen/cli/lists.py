@@ -8,13 +8,12 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from tabulate import tabulate
-
 from morphgen.cli import options as opt
 from morphgen.cli.progress import status
 from morphgen.errors import PartError
 from morphgen.grammar.catalogue import catalogue
 from morphgen.grammar.grammar_file import grammar_names, grammar_summary
+from morphgen.tables import table
 
 if TYPE_CHECKING:  # the list of parts needs no splits
     from morphgen.splits.split import Member, Split
@@ -26,13 +25,16 @@ def list_parts(args: argparse.Namespace) -> None:
     """Print a table with a row per part."""
     with status(args, "reading the parts"):
         rows = catalogue(opt.library_of(args), PART_KINDS.get(args.kind))
-    opt.print_result(args, rows, lambda: tabulate(rows, headers="keys", floatfmt=".3g"))
+    cells = [list(row.values()) for row in rows]
+    last = ("source", "manufacturer")
+    opt.print_result(args, rows, lambda: table(cells, list(rows[0]), formats=".3g", last=last))
 
 
 def list_grammars(args: argparse.Namespace) -> None:
     """Print the names and summaries."""
     rows = [{"name": name, "robots": grammar_summary(name)} for name in grammar_names()]
-    opt.print_result(args, rows, lambda: tabulate(rows, headers="keys"))
+    cells = [(row["name"], row["robots"]) for row in rows]
+    opt.print_result(args, rows, lambda: table(cells, ("name", "robots")))
 
 
 SHORT_DERIVATION = 60
@@ -67,7 +69,7 @@ def list_splits(args: argparse.Namespace) -> None:
         )
         for row in data
     ]
-    opt.print_result(args, data, lambda: tabulate(rows, headers))
+    opt.print_result(args, data, lambda: table(rows, headers, formats="g"))
 
 
 def show_split(args: argparse.Namespace) -> None:
@@ -104,7 +106,7 @@ def _split_text(split: Split, licences: Sequence[str], *, full: bool) -> str:
         counts = ", ".join(f"{n} {name}" for name, n in _categories(members).items())
         rows = [_row(member, full=full) for member in members]
         lines.append(f"\n{side}, {len(members)}: {counts}")
-        lines.append(tabulate(rows, headers, disable_numparse=True))
+        lines.append(table(rows, headers))
     return "\n".join(lines)
 
 

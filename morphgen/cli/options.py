@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
 from inspect import signature
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -14,6 +17,7 @@ from morphgen.errors import BenchmarkError, FormatError, MorphgenError, one_line
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.findings import Finding
 from morphgen.model.robot import Robot
+from morphgen.tables import fitted
 
 if TYPE_CHECKING:  # it loads packages for meshes, which take seconds
     from morphgen.grammar.robot_source import RobotReference
@@ -28,8 +32,16 @@ def arguments(args: argparse.Namespace, function: Callable[..., object]) -> dict
 
 def print_result(args: argparse.Namespace, data: object, text: Callable[[], str]) -> None:
     """Print data as JSON if ``--json`` is given, else text unless it is empty."""
-    if shown := json.dumps(data, default=str) if args.json else text():
+    with fit_terminal(args):
+        shown = json.dumps(data, default=str) if args.json else text()
+    if shown:
         print(shown)
+
+
+def fit_terminal(args: argparse.Namespace) -> AbstractContextManager[None]:
+    """Fit the tables of a block to the terminal; all columns are for files, pipes and --wide."""
+    is_whole = getattr(args, "wide", False) or not sys.stdout.isatty()
+    return fitted(None if is_whole else shutil.get_terminal_size().columns)
 
 
 def finding_line(finding: Finding) -> str:

@@ -22,6 +22,7 @@ from morphgen.rl.runs.checkpoint import read_checkpoint
 from morphgen.rl.runs.robot_source import robot_source
 from morphgen.rl.scores import Score, success_of
 from morphgen.rl.shipped_policies import checkpoint_path, zero_shot_policy
+from morphgen.tables import table
 from morphgen.tasks.reach import GOAL_KINDS
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.render.renderer import require_video_path
@@ -132,4 +133,4 @@ def _table(scores: Mapping[str, Score], task: str) -> str:
         columns["angle [deg]"] = [f"{angle:.1f}" for angle in angles]
     if TASKS[task].relative_to_random:  # the score of others is their success
         columns["score"] = [f"{score.score:.1f}" for score in scores.values()]
-    return tabulate(columns, headers="keys")
+    return table(list(zip(*columns.values(), strict=True)), list(columns), formats="g")

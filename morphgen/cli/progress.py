@@ -1,4 +1,4 @@
-"""Progress of commands on stderr: bars on a terminal, a few lines elsewhere."""
+"""Progress of commands on stderr: bars on a terminal, lines at intervals elsewhere."""
 
 from __future__ import annotations
 
@@ -24,14 +24,12 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+FIRST_LINE = 2.0
+"""Time after which a line says what is done, where there is no terminal [s]."""
 LINE_INTERVAL = 10.0
-"""Time between two lines about an evaluation where there is no terminal [s]."""
+"""Time between two further lines [s]."""
 REDRAW_INTERVAL = 1.0
 """Time after which a bar appears, and between its updates if nothing else happens [s]."""
-GOAL_LINE_INTERVAL = 5.0
-"""Time between two lines about goal sets that are made, where there is no terminal [s]."""
-UPDATE_LINE_INTERVAL = 10.0
-"""Time between two lines about a training where there is no terminal [s]."""
 
 
 @contextmanager
@@ -54,19 +52,24 @@ def _bar(
 ) -> Iterator[Progress]:
     """Yield the function that sets a bar, which disappears at the end.
 
-    Nothing is shown without a terminal or with ``--json``.
+    Without a terminal there are lines instead; nothing is shown with ``--json``.
 
     delay: Time before the bar appears, so that quick commands do not flicker [s].
     """
     raise_if_interrupted()
-    hidden = getattr(args, "json", False) or None  # None: shown on a terminal only
+    if getattr(args, "json", False):
+        yield lambda done, total: raise_if_interrupted()
+        return
+    if not sys.stderr.isatty():
+        with _lines(title, unit, total) as print_progress:
+            yield print_progress
+        return
     shown: tqdm[NoReturn] = tqdm(
         desc=title,
         unit=f" {unit}",
         total=total,
         bar_format=layout,
         file=sys.stderr,
-        disable=hidden,
         delay=delay,
         leave=False,
     )
@@ -76,30 +79,56 @@ def _bar(
         shown.total = shown.total if total is None else total
         shown.update(done - shown.n)  # tqdm counts steps, reports are sums
 
-    with shown, _redrawn(shown):
+    with shown:
+        try:
+            with _repeated(shown.refresh):
+                yield show
+        finally:
+            shown.clear()  # closing it would not: tqdm takes a bar for hidden that others redrew
+
+
+@contextmanager
+def _lines(title: str, unit: str, total: int | None) -> Iterator[Progress]:
+    """Yield the function that counts what is done; lines tell it if the work takes long."""
+    begin = time.monotonic()
+    counted, due, lock = 0.0, begin + FIRST_LINE, threading.Lock()
+
+    def tell() -> None:
+        nonlocal due
+        with lock:
+            if (now := time.monotonic()) < due:
+                return
+            due = now + LINE_INTERVAL
+        of = "" if total is None else f" of {total}"
+        count = f": {counted:.0f}{of} {unit}s" if counted or total else ""
+        note(f"{title}{count}, {now - begin:.0f} s")
+
+    def show(done: float, new_total: int | None) -> None:
+        nonlocal counted, total
+        raise_if_interrupted()
+        counted, total = done, total if new_total is None else new_total
+        tell()
+
+    with _repeated(tell):
         yield show
 
 
 @contextmanager
-def _redrawn(shown: tqdm[NoReturn]) -> Iterator[None]:
-    """Redraw a bar at regular intervals, so that its clock runs while one item takes long."""
-    if shown.disable:
-        yield
-        return
+def _repeated(show: Callable[[], object]) -> Iterator[None]:
+    """Call a function again and again, so that a clock runs while one item takes long."""
     finished = threading.Event()
 
-    def redraw() -> None:
+    def repeat() -> None:
         while not finished.wait(REDRAW_INTERVAL):
-            shown.refresh()
+            show()
 
-    thread = threading.Thread(target=redraw, daemon=True)
+    thread = threading.Thread(target=repeat, daemon=True)
     thread.start()
     try:
         yield
     finally:
         finished.set()
         thread.join()
-        shown.clear()  # closing it would not: tqdm takes a bar for hidden that others redrew
 
 
 def track(
@@ -155,15 +184,9 @@ class TrainingProgress:
         self._shown = ExitStack()
         self._shown.enter_context(status(None, "preparing"))
         self._goal_bar: Progress | None = None
-        self._print_goals = _at_intervals(GOAL_LINE_INTERVAL, "goal sets: {:.0f} of {} robots")
 
     def __call__(self, done: float, total: int | None) -> None:
         """Show how many of the robots have their goal set."""
-        raise_if_interrupted()
-        if not sys.stderr.isatty():
-            if total and done < total:
-                self._print_goals(done, total)
-            return
         if self._goal_bar is None:
             self.close()
             self._goal_bar = self._shown.enter_context(_bar(None, "goal sets"))
@@ -215,10 +238,6 @@ class TrainingProgress:
         """Show how many episodes of an evaluation ended."""
         raise_if_interrupted()
         self.close()
-        if not sys.stderr.isatty():
-            with show_progress(_at_intervals(LINE_INTERVAL, f"{title}: {{:.0f}} of {{}} episodes")):
-                yield
-            return
         layout = "{l_bar}{bar}| {n:.1f}/{total_fmt} [{elapsed}<{remaining}]"
         with _bar(None, title, "episode", layout=layout, delay=0) as show, show_progress(show):
             yield
@@ -249,7 +268,7 @@ def _update_lines(name: str) -> Callable[[UpdateMetrics, int, Mapping[str, str]]
 
     def show(report: UpdateMetrics, total: int, facts: Mapping[str, str]) -> None:
         nonlocal last
-        if time.monotonic() < last + UPDATE_LINE_INTERVAL and report.update < total:
+        if time.monotonic() < last + LINE_INTERVAL and report.update < total:
             return
         last = time.monotonic()
         # Every update has equally many transitions.
@@ -262,19 +281,6 @@ def _update_lines(name: str) -> Callable[[UpdateMetrics, int, Mapping[str, str]]
         )
 
     return show
-
-
-def _at_intervals(interval: float, line: str) -> Progress:
-    """Return a function that prints a line, but not more often than at an interval [s]."""
-    last = time.monotonic()
-
-    def update(done: float, total: int | None) -> None:
-        nonlocal last
-        if time.monotonic() - last > interval:
-            last = time.monotonic()
-            note(line.format(done, total))
-
-    return update
 
 
 def _print_divergence(name: str, counts: Counter[str]) -> None:

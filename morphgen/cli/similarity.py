@@ -8,12 +8,12 @@ import io
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import groupby
 
 import numpy as np
-from tabulate import tabulate
 
 from morphgen.cli import options as opt
-from morphgen.cli.progress import bar, track
+from morphgen.cli.progress import bar, status, track
 from morphgen.encoding.similarity import (
     Features,
     classical_mds,
@@ -33,9 +33,12 @@ from morphgen.encoding.tokens import tokens as encode
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.files import require_writable_file, write_file
+from morphgen.grammar.derivation import parse_derivation
+from morphgen.grammar.library import Library
 from morphgen.model.geometry import Box, Cylinder, Shape, Sphere
 from morphgen.model.robot import Robot
 from morphgen.progress import part_of
+from morphgen.tables import fits, fitted, is_whole, table
 from morphgen.typing import Array
 
 MEASURES = ("cosine", "tree", "workspace", "all")
@@ -57,14 +60,15 @@ def similarity(args: argparse.Namespace) -> None:
         require_writable_file(path, option_name, suffix)
         if files.count(path.resolve()) > 1:
             raise BenchmarkError(f"{path}: is named for two files; name another for one of them")
-    robots, names = _features(args)
+    robots, names, groups = _features(args)
     matrices: dict[str, Array] = {}
     pairs = len(measures) * len(names) * (len(names) + 1) // 2
     with bar(args, "comparing", "pair", pairs):
         for name in measures:
             with part_of(pairs, len(matrices) * pairs // len(measures)):
                 matrices[name] = similarity_matrix(robots, name)
-    contents = {path: write(names, matrices) for path, _, write in given.values()}
+    with status(args, "drawing"):
+        contents = {path: write(names, matrices, groups) for path, _, write in given.values()}
     for path, content in contents.items():
         write_file(path, content)
     results = {
@@ -83,22 +87,40 @@ def similarity(args: argparse.Namespace) -> None:
     opt.print_result(args, data, text)
 
 
-def _features(args: argparse.Namespace) -> tuple[list[Features], list[str]]:
-    """Return the features of the robots and their names; equal names are replaced by labels."""
-    pairs, folders = opt.read_robots(args), opt.library_of(args).folders
+def _features(args: argparse.Namespace) -> tuple[list[Features], list[str], list[str]]:
+    """Return the features of the robots, their names and groups.
+
+    Equal names are replaced by labels.
+    """
+    pairs, library = opt.read_robots(args), opt.library_of(args)
     if len(pairs) < 2:
         raise BenchmarkError(f"{pairs[0][0].label} is one robot; name others to compare it with")
     max_links = _max_links(args, [robot for _, robot in pairs])
     computed = []
     for source, robot in track(pairs, args, "computing features", "robot", len(pairs)):
         try:
-            computed.append(features(robot, token_shapes(robot, folders), max_links=max_links))
+            shapes = token_shapes(robot, library.folders)
+            computed.append(features(robot, shapes, max_links=max_links))
         except BenchmarkError as error:
             raise BenchmarkError(f"{source.label}: {error}") from error
     names = [robot.name for _, robot in pairs]
     if len(set(names)) < len(names):
         names = [source.label for source, _ in pairs]
-    return computed, names
+    groups = [_group(robot, args.colour, library) for _, robot in pairs] if args.map else []
+    return computed, names, groups
+
+
+def _group(robot: Robot, colour: str, library: Library) -> str:
+    """Return what robots of one colour have in common: parts and DoF, or the parts of a kind."""
+    text = robot.provenance.get("derivation")
+    parts = [node.part for node in parse_derivation(str(text)).walk()] if text else []
+    if colour != "structure":
+        parts = [part for part in parts if library.manifest(part).kind == colour]
+    runs = [(part, len(list(run))) for part, run in groupby(parts) if part not in ("fixed", "none")]
+    words = "-".join(f"{part} x{count}" if count > 1 else part for part, count in runs)
+    if colour != "structure":
+        return words or f"no {colour}"
+    return f"{words or 'imported'}, {robot.dof} DoF"
 
 
 def _max_links(args: argparse.Namespace, robots: Sequence[Robot]) -> int:
@@ -117,19 +139,25 @@ def _max_links(args: argparse.Namespace, robots: Sequence[Robot]) -> int:
 def _text(names: Sequence[str], measure: str, values: Array) -> str:
     """Return the table of a measure with its title and statistics."""
     better = "larger" if get_measure(measure).larger_is_more_alike else "smaller"
-    table = _matrix_table if len(names) <= LARGEST_MATRIX else _nearest_table
+    rows = _matrix_table(names, values) if len(names) <= LARGEST_MATRIX else ""
+    if not rows and not is_whole():
+        rows = f"{len(names)} robots; --wide shows the nearest of each, --json the matrix"
+    elif not rows or not fits(rows):
+        rows = _nearest_table(names, measure, values)
     pairs = values[np.triu_indices(len(values), 1)]  # the matrix is symmetric: each pair once
     low, median, high = np.percentile(pairs, (0, 50, 100))
     return (
-        f"{_title(measure)}; {better} is more alike\n{table(names, measure, values)}\n"
+        f"{_title(measure)}; {better} is more alike\n{rows}\n"
         f"{len(pairs)} pairs: mean {pairs.mean():.3f}, median {median:.3f}, "
         f"from {low:.3f} to {high:.3f}"
     )
 
 
-def _matrix_table(names: Sequence[str], measure: str, values: Array) -> str:
+def _matrix_table(names: Sequence[str], values: Array) -> str:
     rows = [(i, name, *row) for i, (name, row) in enumerate(zip(names, values, strict=True))]
-    return tabulate(rows, ("#", "robot", *map(str, range(len(names)))), floatfmt=".3f")
+    titles = ("#", "robot", *map(str, range(len(names))))
+    with fitted(None):  # a part of a matrix says little
+        return table(rows, titles, formats=".3f")
 
 
 def _nearest_table(names: Sequence[str], measure: str, values: Array) -> str:
@@ -140,10 +168,10 @@ def _nearest_table(names: Sequence[str], measure: str, values: Array) -> str:
         (name, names[nearest], values[i, nearest], means[i])
         for i, (name, nearest) in enumerate(zip(names, distance.argmin(axis=1), strict=True))
     ]
-    return tabulate(rows, ("robot", "nearest", measure, "mean of others"), floatfmt=".3f")
+    return table(rows, ("robot", "nearest", measure, "mean of others"), formats=".3f")
 
 
-def _heatmap(names: Sequence[str], matrices: dict[str, Array]) -> bytes:
+def _heatmap(names: Sequence[str], matrices: dict[str, Array], groups: Sequence[str]) -> bytes:
     from morphgen.benchmark.figures import Panel, heatmap_png
 
     panels = []
@@ -152,20 +180,20 @@ def _heatmap(names: Sequence[str], matrices: dict[str, Array]) -> bytes:
     return heatmap_png(names, panels)
 
 
-def _map(names: Sequence[str], matrices: dict[str, Array]) -> bytes:
+def _map(names: Sequence[str], matrices: dict[str, Array], groups: Sequence[str]) -> bytes:
     from morphgen.benchmark.figures import MapPanel, map_png
 
     panels = []
     for name, values in matrices.items():
         panels.append(MapPanel(_title(name), classical_mds(to_distances(values, name))))
-    return map_png(names, panels)
+    return map_png(names, panels, groups)
 
 
 def _title(measure: str) -> str:
     return f"{measure}: {get_measure(measure).meaning}"
 
 
-def _csv(names: Sequence[str], matrices: dict[str, Array]) -> bytes:
+def _csv(names: Sequence[str], matrices: dict[str, Array], groups: Sequence[str]) -> bytes:
     """Return a CSV table with a row per pair: two names and the value of each measure."""
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
@@ -246,8 +274,7 @@ def _tokens_text(robot: Robot, tokens: Array, max_links: int) -> str:
                 f"{home[i - 1] + 0.0:.3f}" if i - 1 in home else "",
             )
         )
-    table = tabulate(rows, HEADERS, disable_numparse=True)
-    return f"{table}\n{robot.name}: {tokens.shape}, indices over {max_links - 1}"
+    return f"{table(rows, HEADERS)}\n{robot.name}: {tokens.shape}, indices over {max_links - 1}"
 
 
 def _geometry_text(shape: Shape | None) -> str:
@@ -269,7 +296,7 @@ def _numbers(values: Sequence[float], digits: int = 3) -> str:
 
 def _layout_text() -> str:
     rows = [(f.name, f"{f.start}:{f.columns.stop}", f.size, f.content) for f in LAYOUT]
-    return tabulate(rows, ("field", "columns", "size", "content"), disable_numparse=True)
+    return table(rows, ("field", "columns", "size", "content"))
 
 
 def _layout_data() -> list[dict[str, object]]:

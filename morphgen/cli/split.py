@@ -9,8 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-from tabulate import tabulate
-
 from morphgen.api.goals import goals as sample_goals
 from morphgen.api.splits import DEFAULT_TRAIN, NewSplit
 from morphgen.api.splits import split as choose
@@ -47,6 +45,7 @@ from morphgen.model.findings import Finding
 from morphgen.rl.baselines import BASELINES
 from morphgen.splits.split import HOLD_OUT, SIDES, Split, split_id
 from morphgen.splits.split_file import read_split, split_names, split_paths, write_new_splits
+from morphgen.tables import table
 from morphgen.tasks.goals.split_goals import (
     GoalResult,
     SplitGoals,
@@ -125,7 +124,7 @@ def _audit_text(result: Audit, passed: bool, goals: SplitGoals | None, limits: s
         nearest.setdefault(neighbour.test, []).append(cell)
     rows = [(test, *cells) for test, cells in nearest.items()]
     headers = ("test robot", *(f"nearest by {name}" for name in MEASURES))
-    lines = [tabulate(rows, headers, disable_numparse=True)] if rows else []
+    lines = [table(rows, headers)] if rows else []
     reasons = {finding.code: reason for finding, reason in result.accepted}
     for code, findings in _by_code(result.findings).items():
         lines.append(f"{findings[0].severity} {code} ({len(findings)})")
@@ -271,7 +270,7 @@ def stats(args: argparse.Namespace) -> None:
         ]
         style = "github" if args.markdown else "simple"
         lines = [
-            tabulate(rows, "keys", tablefmt=style, disable_numparse=True),
+            table([list(row.values()) for row in rows], list(rows[0]), style=style),
             "",
             "links, joints, mass: mean over the train robots; cosine: of test and train robots",
             f"in parentheses: {PAPER_TABLE}",

@@ -19,6 +19,8 @@ from morphgen.benchmark.eval_protocol import (
 from morphgen.benchmark.release import (
     SUBMISSIONS_DIR,
     ReleaseRequest,
+    archive_path,
+    check_release,
     is_release,
     opened_folder,
     read_release,
@@ -77,11 +79,21 @@ def release(args: argparse.Namespace) -> None:
         goals=not args.no_goals,
         settings=BuildSettings(light=args.light),
     )
+    notes = _notes(args, split, extra)
+    if not args.json:
+        print("".join(f"note: {note}\n" for note in notes), end="", flush=True)
+    archive = archive_path(args.out, split, request.version)
+    if args.dry_run:
+        with bar(args, "checking"):
+            check_release(split, library, request, jobs=args.jobs)
+        data: dict[str, object] = {"archive": str(archive), "notes": notes}
+        text = f"{archive} would be written: names, licences and audit are in order"
+        opt.print_result(args, data, lambda: text)
+        return
     with bar(args, "releasing"):
         report = release_split(
             split, args.out, library, request, extra=extra, results=results, jobs=args.jobs
         )
-    notes = _notes(args, split, extra)
     data = {
         "archive": str(report.archive),
         "sha256": report.sha256,
@@ -95,14 +107,16 @@ def release(args: argparse.Namespace) -> None:
         f"  sha256: {report.sha256}",
         f"  content: {report.content}",
     ]
-    lines += [f"  note: {note}" for note in notes]
     lines.append(f"verify it anywhere: morphgen split verify {report.archive}")
     opt.print_result(args, data, lambda: "\n".join(lines))
 
 
 def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -> list[str]:
-    """Return what the release lacks that its users may expect."""
+    """Return what the release lacks that its users may expect, and what may keep it from it."""
     notes = []
+    archive = archive_path(args.out, split, args.release_version)
+    if archive.exists():
+        notes.append(f"{archive} exists: it stays, unless the content is the same")
     is_relative = any(TASKS[task].relative_to_random for task in tasks_of_split(split))
     if is_relative and f"{SUBMISSIONS_DIR}/random.json" not in extra:
         missing = "submission of random among --scores" if extra else "reference scores"
@@ -114,6 +128,8 @@ def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -
         notes.append("no reference scores: add submissions or studies with --scores")
     if not args.date:
         notes.append("no --date: dataset tools recommend a date of publication")
+    if not args.creator:
+        notes.append("no --creator: the citation will name nobody")
     return notes
 
 

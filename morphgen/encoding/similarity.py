@@ -511,14 +511,19 @@ class MdsMap:
 
     points: Array
     """Centred points in units of the distances, shape (n, 2); the first axis varies most."""
-    kept: float  # share of the total variation that the two dimensions show, in [0, 1]
+    shares: tuple[float, float]  # shares of the total variation that the axes show, in [0, 1]
+
+    @property
+    def kept(self) -> float:
+        """Share of the total variation that the map shows, in [0, 1]."""
+        return sum(self.shares)
 
 
 def classical_mds(distances: ArrayLike) -> MdsMap:
     """Embed distances in the plane by classical multidimensional scaling (Torgerson, 1952).
 
-    The axes are the two largest eigenvectors of the doubly centred squared distances. ``kept`` is
-    their share of the sum of all eigenvalues' magnitudes (Mardia, Kent and Bibby, Multivariate
+    The axes are the two largest eigenvectors of the doubly centred squared distances. ``shares``
+    are their parts of the sum of all eigenvalues' magnitudes (Mardia, Kent and Bibby, Multivariate
     analysis, 1979, section 14.4), because non-Euclidean distances give negative eigenvalues. The
     sign of each axis is chosen so that the farthest point, or the first of several, is positive.
 
@@ -538,12 +543,13 @@ def classical_mds(distances: ArrayLike) -> MdsMap:
     points = np.zeros((len(d), 2))
     points[:, : len(largest)] = vectors[:, ::-1][:, :2] * np.sqrt(largest)
     if total <= _ZERO_EIGENVALUE * len(d) * squared.max(initial=0.0):
-        return MdsMap(np.zeros_like(points), 1.0)
+        return MdsMap(np.zeros_like(points), (1.0, 0.0))
     size = np.abs(points)
     farthest = (size >= size.max(axis=0) * (1 - _TIE_TOLERANCE)).argmax(axis=0)
     sign = np.where(points[farthest, [0, 1]] < 0, -1.0, 1.0)
     # Adding 0.0 turns -0.0 into 0.0.
-    return MdsMap(points * sign + 0.0, float(largest.sum() / total))
+    shares = [float(value / total) for value in largest] + [0.0]  # of one robot there is one
+    return MdsMap(points * sign + 0.0, (shares[0], shares[1]))
 
 
 @dataclass(frozen=True)

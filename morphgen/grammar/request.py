@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from morphgen.errors import CompositionError, GrammarError, nearest
@@ -40,14 +40,12 @@ def pin(grammar: Grammar, words: Sequence[str], library: Library) -> Grammar:
         elif any(let.name == key for let in grammar.lets):
             grammar = _pin_let(grammar, key, value)
         else:
-            grammar = _pin_symbol(grammar, key, value)
+            grammar = _pin_symbol(grammar, key, value, library)
     return grammar
 
 
 def _pin_parameter(grammar: Grammar, part: str, name: str, value: str, library: Library) -> Grammar:
-    names = {item.name for production in grammar.productions for item in production.items()}
-    parts = {name for name in names if grammar.production(name) is None}
-    if part not in parts:
+    if part not in (parts := _parts(grammar)):
         raise GrammarError(
             f"{part}.{name}: no part {part!r} in {grammar.name!r}{nearest(part, parts)}"
         )
@@ -73,6 +71,17 @@ def _pin_parameter(grammar: Grammar, part: str, name: str, value: str, library: 
     return replace(grammar, productions=tuple(map(with_pinned, grammar.productions)))
 
 
+def _parts(grammar: Grammar) -> set[str]:
+    """Return the names of the parts that a grammar uses."""
+    names = {item.name for production in grammar.productions for item in production.items()}
+    return {name for name in names if grammar.production(name) is None}
+
+
+def dotted_keys(owners: Iterable[tuple[str, Manifest]]) -> Iterator[str]:
+    """Yield the keys of the parameters of parts, such as ``ee.size``, by the names of the parts."""
+    return (f"{owner}.{name}" for owner, part in owners for name in part.attached_parameters)
+
+
 def _pin_let(grammar: Grammar, name: str, value: str) -> Grammar:
     number = parse_condition(value, f"{name}={value}")
     unsigned = number.operands[0] if number.operator == "negative" else number
@@ -83,11 +92,13 @@ def _pin_let(grammar: Grammar, name: str, value: str) -> Grammar:
     return replace(grammar, lets=tuple(lets))
 
 
-def _pin_symbol(grammar: Grammar, symbol: str, value: str) -> Grammar:
+def _pin_symbol(grammar: Grammar, symbol: str, value: str, library: Library) -> Grammar:
     production = grammar.production(symbol)
     if production is None:
         valid = [*(p.symbol for p in grammar.productions), *(let.name for let in grammar.lets)]
-        raise GrammarError(f"{symbol}={value}: no symbol {symbol!r}{nearest(symbol, valid)}")
+        manifests = (library.manifest(part) for part in _parts(grammar))
+        hint = nearest(symbol, valid, dotted_keys((each.name, each) for each in manifests))
+        raise GrammarError(f"{symbol}={value}: no symbol {symbol!r}{hint}")
     if value.isdecimal() and len(value) <= MAX_WORD:
         pinned = _with_count(production, int(value))
     else:
@@ -202,7 +213,7 @@ def parse_request(words: Sequence[str], library: Library) -> Derivation:
     port of a limb: ``left.arm=ur5``. Every other key is a parameter of a part: ``ee.size=80mm``,
     ``left.ee.mount_yaw=45deg``.
     """
-    slots = _parse_slots(words)
+    slots = _parse_slots(words, library)
     base = slots.pop("base", _Slot("base", "", "fixed"))
     if not slots:
         raise CompositionError(
@@ -235,7 +246,7 @@ def default_name(derivation: Derivation, library: Library) -> str:
     return "-".join(words)
 
 
-def _parse_slots(words: Sequence[str]) -> dict[str, _Slot]:
+def _parse_slots(words: Sequence[str], library: Library) -> dict[str, _Slot]:
     """Return the parts that ``key=value`` words choose, with their parameters, by key."""
     slots: dict[str, _Slot] = {}
     values: dict[str, str] = {}
@@ -260,24 +271,24 @@ def _parse_slots(words: Sequence[str]) -> dict[str, _Slot]:
     if any(key != "base" for key in slots):
         slots.setdefault("base", _Slot("base", "", "fixed"))
     for key, value in values.items():
-        _assign(key, value, slots)
+        _assign(key, value, slots, library)
     return slots
 
 
-def _assign(key: str, value: str, slots: Mapping[str, _Slot]) -> None:
+def _assign(key: str, value: str, slots: Mapping[str, _Slot], library: Library) -> None:
     """Give a parameter's value to the slot of its part."""
     owner, _, name = key.rpartition(".")
     if owner in slots:
         slots[owner].values[name] = value
-    elif owner:
-        raise CompositionError(
-            f"{key}={value}: no part is chosen for {owner!r}{nearest(owner, slots)}"
-        )
-    else:
-        raise CompositionError(
-            f"{key}={value}: unknown key {key!r}; expected {', '.join(SLOTS)}, a limb such as "
-            "left.arm or left.ee, or a parameter of a part such as ee.size"
-        )
+        return
+    chosen = ((slot.key, library.manifest(slot.part, slot.kind)) for slot in slots.values())
+    hint = nearest(key, SLOTS, dotted_keys(chosen))
+    if owner:
+        raise CompositionError(f"{key}={value}: no part is chosen for {owner!r}{hint}")
+    raise CompositionError(
+        f"{key}={value}: unknown key {key!r}{hint}, a limb such as left.arm or left.ee, or a "
+        "parameter of a part such as ee.size"
+    )
 
 
 def _limbs(

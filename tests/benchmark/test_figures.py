@@ -5,8 +5,10 @@ import io
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib.text import Text
 from PIL import Image
 
+from morphgen.benchmark import figures
 from morphgen.benchmark.figures import (
     MAX_NAMED,
     MAX_WITH_VALUES,
@@ -31,8 +33,12 @@ def map_panel(n, title="tree"):
     return MapPanel(title, classical_mds(panel(n).values))
 
 
+def groups(n):
+    return [f"{i % 3 + 4} DoF" for i in range(n)]
+
+
 def drawings(n):
-    return heatmap_png(names(n), [panel(n)]), map_png(names(n), [map_panel(n)])
+    return heatmap_png(names(n), [panel(n)]), map_png(names(n), [map_panel(n)], groups(n))
 
 
 def pixels(png):
@@ -87,16 +93,57 @@ def test_robots_of_a_matrix_are_labelled_up_to_a_limit():
 def test_names_are_not_parsed_as_formulas():
     odd = ["$\\frac$", "a_b", "$", "\\alpha"]  # the first would be refused as one
     assert heatmap_png(odd, [panel(4)])
-    assert map_png(odd, [map_panel(4)])
+    assert map_png(odd, [map_panel(4)], odd)
 
 
-def test_families_have_different_colours():
-    points = map_panel(6)
-    grey = pixels(map_png(list("abcdef"), [points]))
-    coloured = pixels(map_png(["a-1", "a-2", "a-3", "b-1", "b-2", "c"], [points]))
+@pytest.fixture
+def drawn(monkeypatch):
+    """Return a function that draws a map and returns its figure."""
 
-    def colourful(picture):
-        return int((np.ptp(picture, axis=-1) > 60).sum())
+    def draw(n, groups):
+        kept = []
+        monkeypatch.setattr(figures, "_png", lambda figure: kept.append(figure) or b"")
+        map_png(names(n), [map_panel(n)], groups)
+        return kept[0]
 
-    assert colourful(grey) == 0
-    assert colourful(coloured) > 100
+    return draw
+
+
+@pytest.mark.parametrize("n", [10, 40, 200])
+def test_a_map_has_names_that_cover_neither_each_other_nor_points(n, drawn):
+    figure = drawn(n, groups(n))
+    (ax,) = figure.axes
+    renderer = figure.canvas.get_renderer()
+    for text in ax.texts:
+        text.update_positions(renderer)
+    boxes = [Text.get_window_extent(text, renderer) for text in ax.texts]  # without arrows
+    points = ax.transData.transform(np.vstack([each.get_offsets() for each in ax.collections]))
+    assert len(boxes) == 10 if n == 10 else 10 < len(boxes) <= 30
+    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
+    assert not any(box.contains(*point) for box in boxes for point in points)
+
+
+def test_a_map_names_its_axes_and_its_groups(drawn):
+    figure = drawn(40, ["4 DoF"] * 10 + ["6 DoF"] * 30)
+    (ax,) = figure.axes
+    first, second = map_panel(40).map.shares
+    assert f"{first:.0%}" in ax.get_xlabel()
+    assert f"{second:.0%}" in ax.get_ylabel()
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert texts == ["6 DoF (30)", "4 DoF (10)"]
+    colours = {tuple(each.get_facecolor()[0]) for each in ax.collections}
+    assert len(colours) == 2
+    legend = figure.legends[0].get_window_extent(figure.canvas.get_renderer())
+    assert not legend.overlaps(ax.bbox)
+
+
+def test_of_many_groups_the_largest_have_a_colour(drawn):
+    figure = drawn(60, [f"{min(i, 30)} DoF" for i in range(60)])
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert texts[0] == "13 smaller groups (13)"
+    assert texts[1] == "30 DoF (30)"
+    styles = {
+        (tuple(each.get_facecolor()[0]), each.get_paths()[0].vertices.shape)
+        for each in figure.axes[0].collections
+    }
+    assert len(styles) == len(texts) == 19

@@ -343,6 +343,7 @@ def test_only_rules_of_one_part_hold_out_the_part_itself():
     [
         ("arm=kinva*", "--hold-out arm=kinva*: no arm matches 'kinva*'; did you mean"),
         ("amr=ur5", "unknown key 'amr'; did you mean 'arm'? valid: arm, base, body, ee, manu"),
+        ("arm3_length=0.1..0.2", "unknown key 'arm3_length'; did you mean 'arm3.length'? valid: a"),
         ("arm", "--hold-out arm: expected KEY=VALUE, such as arm=kinova*, manufacturer=Kinova"),
         ("arm=ur5,", "--hold-out arm=ur5,: empty rule: expected KEY=VALUE"),
         ("arm=ur5,arm=ur5", "arm=ur5 is there twice"),

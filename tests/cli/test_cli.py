@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 from dataclasses import replace
 from importlib import import_module
 from importlib.metadata import version
@@ -46,6 +47,21 @@ def test_list_prints_one_row_per_part(ok):
     assert {row[1] for row in rows} == {"base"}
     out = ok("list", "bases", "--json")
     assert {row["name"]: row["dof"] for row in json.loads(out)}["gantry"] == 5
+
+
+@pytest.mark.parametrize(
+    "words", [["list", "arms"], ["split", "list"], ["grammar", "list"], ["conform", "gantry-plane"]]
+)
+def test_tables_fit_the_terminal(words, ok, monkeypatch):
+    piped = ok(*words)
+    assert max(map(len, piped.splitlines())) > 80
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "80")
+    shown = ok(*words)
+    assert max(map(len, shown.splitlines())) <= 80
+    assert len(shown.splitlines()) >= len(piped.splitlines())
+    if words[0] != "conform":  # its numbers are measured anew
+        assert ok(*words, "--wide") == piped
 
 
 def test_show_prints_the_tree(ok, robot_urdf):

@@ -1,6 +1,7 @@
 """``morphgen export``."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -103,6 +104,23 @@ def test_files_of_a_bundle_are_written_into_it(run, tmp_path):
     assert read_srdf(bundle / "robot.srdf").find("group").get("name") == "arm"
     assert (bundle / "robot.glb").read_bytes()[:4] == b"glTF"
     assert file_findings(bundle) == ()
+
+
+def test_folders_go_beside_the_bundle_and_into_an_output_folder_that_is_made(ok, refused, tmp_path):
+    bundle = write_bundle(arm(), tmp_path / "robots" / "arm", picture=False)
+    words = ("--format", "urdf")
+    beside = str(bundle.parent / "arm-urdf")
+    assert ok("export", bundle, *words).strip() == beside
+    assert ok("export", bundle / "robot.urdf", *words).strip() == beside
+    assert ok("export", "base=planar", "ee=cube", *words).strip() == "planar-cube-urdf"
+    assert ok("export", bundle, *words, "--out", "new/folder").strip() == "new/folder/arm-urdf"
+    assert ok("export", bundle, "--format", "glb", "--out", "other").strip() == "other/arm.glb"
+    toolless = write_bundle(replace(arm(), frames=()), tmp_path / "robots" / "b", picture=False)
+    for name in ("srdf", "ros2"):
+        refused("export", toolless, "--format", name, "--out", "none/of/it")
+    assert not Path("none").exists()
+    err = refused("export", bundle, "--out", bundle / "robot.urdf")
+    assert "cannot write to" in err
 
 
 def test_robots_of_one_name_are_not_written_over_each_other(run, tmp_path):

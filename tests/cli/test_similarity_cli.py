@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 import morphgen
 from helpers.commands import tree
 from helpers.robots import arm
+from morphgen.benchmark import figures
 from morphgen.encoding.similarity import MEASURES, features, similarity_matrix
 from morphgen.encoding.tokens import LAYOUT, robot_from_tokens, tokens
 from morphgen.fitting.token_shapes import token_shapes
@@ -128,6 +130,32 @@ def test_pictures_are_written(ok, bundles, tmp_path):
     first = tree(tmp_path)
     assert first["heat.png"].startswith(b"\x89PNG")
     assert first["map.png"].startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("colour", "groups"),
+    [
+        ("structure", ["imported, 4 DoF", "lwr-claw, 11 DoF", "lwr-plane, 7 DoF"]),
+        ("arm", ["no arm", "lwr", "lwr"]),
+        ("ee", ["no ee", "claw", "plane"]),
+    ],
+)
+def test_a_map_is_coloured_by_structure_or_part(colour, groups, ok, bundles, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(figures, "map_png", lambda *arguments: drawn.append(arguments) or b"png")
+    ok("similarity", "robots", "--map", "map.png", "--colour", colour)
+    assert drawn[0][2] == groups
+
+
+def test_a_terminal_shows_the_rows_of_many_robots_on_request(run, ok, monkeypatch):
+    run("sample", "stick", "-n", "21", "--light", "--out", "set", "--json")
+    whole = ok("similarity", "set")
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "80")
+    assert ok("similarity", "set", "--wide") == whole
+    title, line, statistics = ok("similarity", "set").splitlines()
+    assert (title, statistics) == (whole.splitlines()[0], whole.splitlines()[-1])
+    assert line == "21 robots; --wide shows the nearest of each, --json the matrix"
 
 
 def test_robot_without_a_tool_is_rejected_with_its_path(refused, robot_urdf, bundles):

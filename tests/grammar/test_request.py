@@ -67,7 +67,10 @@ def test_the_name_marks_changed_parameters():
         ("arm=ur5 ee=plane ee.sise=1", "no parameter 'sise'; did you mean 'size'"),
         ("arm=ur5 arm=ur3", "arm is given twice"),
         ("arm=ur5 ee.size=1", "no part is chosen for 'ee'"),
-        ("arm=ur5 legs=4", "legs=4: unknown key 'legs'; expected base, arm, ee"),
+        ("arm=ur5 legs=4", "legs=4: unknown key 'legs'; valid: arm, base, ee, a limb such as"),
+        ("arm=ur5 ee=plane ee_size=80mm", "unknown key 'ee_size'; did you mean 'ee.size'? valid: "),
+        ("arm=ur5 ee=plane e.size=80mm", "chosen for 'e'; did you mean 'ee.size'? valid: arm"),
+        ("left.arm=ur5 left.ee=plane left_ee_size=1", "did you mean 'left.ee.size'"),
         ("arm", "not of the form key=value"),
         ("base=fixed", "nothing to compose"),
         ("up.arm=ur5", "'fixed' has no port 'up'"),
@@ -79,6 +82,11 @@ def test_invalid_requests_are_errors(text, message):
     with pytest.raises(MorphgenError, match=r"^[^\n]*$") as caught:
         derived(text)
     assert message in str(caught.value)
+
+
+def test_a_grammar_names_the_parameter_that_was_meant():
+    with pytest.raises(MorphgenError, match="no symbol 'claw_size'; did you mean 'claw.size'"):
+        parse_words(["arm3", "claw_size=1"], LIBRARY)
 
 
 def parts(links_grammar, *words):

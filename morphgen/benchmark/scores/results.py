@@ -18,7 +18,6 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
-from tabulate import tabulate
 
 from morphgen.benchmark.eval_protocol import EvalProtocol, expected_robots
 from morphgen.benchmark.release import SCORES_FILE, SUBMISSIONS_DIR
@@ -54,6 +53,7 @@ from morphgen.rl.scores import (
 )
 from morphgen.splits.split import SIDES, Side, Split, split_id
 from morphgen.splits.split_file import read_split, split_names
+from morphgen.tables import table
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
 
@@ -170,7 +170,7 @@ def ranking_table(rows: Sequence[Row], style: str = "simple") -> str:
         for group in groups:
             cells += _cells(row.sides.get(group), decimals[group])
         lines.append([*cells, str(row.episodes)])
-    return tabulate(lines, [*headers, "episodes"], tablefmt=style, disable_numparse=True)
+    return table(lines, [*headers, "episodes"], style=style, last=("from", "seeds"))
 
 
 def ranking_data(rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -481,10 +481,10 @@ def _difference(
     strata: list[Array] = []
     for name in robots:
         own = relative_scores(reference[name])
-        for table in tables:
-            if len(table[name].score) % len(own):
+        for each in tables:
+            if len(each[name].score) % len(own):
                 raise BenchmarkError(
-                    f"robot {name}: {len(table[name].score)} episodes; expected a multiple of the "
+                    f"robot {name}: {len(each[name].score)} episodes; expected a multiple of the "
                     f"{len(own)} of the reference"
                 )
         # Policies of single robots have the episodes of each policy one after another.
@@ -500,6 +500,10 @@ def rows_data(rows: Sequence[ResultRow]) -> list[Any]:
     return [finite_or_none(asdict(row)) for row in rows]
 
 
+_LESS = ("trained", "fine-tuned", *(f"{name} IQM" for name in SIDE_NAMES.values()))
+"""Columns of result tables that a narrow terminal leaves out first."""
+
+
 def result_tables(rows: Sequence[ResultRow], style: str = "simple") -> str:
     """Return a table for every split and task, under its name."""
     parts = []
@@ -513,8 +517,8 @@ def result_tables(rows: Sequence[ResultRow], style: str = "simple") -> str:
         decimals = score_decimals(side.mean for row in own for side in row.sides.values())
         lines = [_line(row, decimals) for row in own]
         title = split if split.endswith(f"/{task}") else f"{split}: {task}"
-        table = tabulate(lines, headers, tablefmt=style, disable_numparse=True)
-        parts.append(f"{'## ' * (style == 'github')}{title}\n\n{table}\n")
+        text = table(lines, headers, style=style, last=[*_LESS, reference])
+        parts.append(f"{'## ' * (style == 'github')}{title}\n\n{text}\n")
     return "\n".join(parts)
 
 

@@ -1,0 +1,105 @@
+"""Tables as text: whole for files and pipes, with the columns that fit for terminals.
+
+The width of the terminal is in a context variable, so that whoever makes a table need not know it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+from tabulate import tabulate
+
+from morphgen.errors import shortened
+
+_width: ContextVar[int | None] = ContextVar("width", default=None)
+
+_GAP = 2
+"""Width of the gap between two columns, and of tabulate's padding of headers [characters]."""
+_LEAST_TEXT = 16
+"""Least width to which the cells of a column are shortened [characters]."""
+
+
+@contextmanager
+def fitted(width: int | None) -> Iterator[None]:
+    """Let the tables of a block have at most a width [characters]; None for any width."""
+    token = _width.set(width)
+    try:
+        yield
+    finally:
+        _width.reset(token)
+
+
+def is_whole() -> bool:
+    """Return whether tables are whole here, because no terminal or ``--wide`` is there."""
+    return _width.get() is None
+
+
+def fits(text: str) -> bool:
+    """Return whether a text is not wider than the terminal for which this block prints, if any."""
+    width = _width.get()
+    return width is None or _width_of(text) <= width
+
+
+def table(
+    rows: Sequence[Sequence[object]],
+    headers: Sequence[str],
+    *,
+    style: str = "simple",
+    formats: str | Sequence[str] | None = None,
+    last: Sequence[str] = (),
+) -> str:
+    """Return a table, in a block of ``fitted`` with as many columns as its width holds.
+
+    Columns are left out from the right, after those of ``last``; a text is shortened where that
+    keeps its column. A line below names the columns that are left out. Tables of Markdown are
+    always whole.
+
+    Args:
+        rows: Cells, as many in each row as there are headers.
+        headers: Titles of the columns; in style ``plain`` a row like the others, without padding.
+        style: One of tabulate's.
+        formats: Format of numbers, for all columns or for each; by default all cells are texts.
+        last: Titles of the columns that are left out first.
+    """
+    if formats is None or isinstance(formats, str):
+        number_formats = [formats or "g"] * len(headers)
+    else:
+        number_formats = list(formats)
+
+    def text(columns: Sequence[int], cut: int = -1, room: int = 0) -> str:
+        titles: list[str] = [headers[i] for i in columns]
+        lines: list[Sequence[object]] = [
+            [shortened(str(row[i]), room) if i == cut else row[i] for i in columns] for row in rows
+        ]
+        if style == "plain":
+            lines, titles = [titles, *lines], []
+        return tabulate(
+            lines,
+            titles,
+            tablefmt=style,
+            floatfmt=[number_formats[i] for i in columns],
+            disable_numparse=formats is None,
+        )
+
+    everything = range(len(headers))
+    result = text(everything)
+    if style == "github" or fits(result):
+        return result
+    order = [i for i in everything if headers[i] not in last]
+    order += [i for i in everything if headers[i] in last]
+    kept = len(order) - 1
+    while kept and not fits(text(sorted(order[:kept]))):
+        kept -= 1
+    shown = sorted(order[:kept])
+    room = (_width.get() or 0) - (_width_of(text(shown)) + _GAP if shown else 0)
+    if not shown or room >= max(_LEAST_TEXT, len(headers[order[kept]]) + _GAP):
+        shown = sorted(order[: kept + 1])
+    result = text(shown, order[kept], room)
+    hidden = dict.fromkeys(headers[i] for i in everything if i not in shown)
+    return f"{result}\n(--wide shows {', '.join(hidden)})" if hidden else result
+
+
+def _width_of(text: str) -> int:
+    return max(map(len, text.splitlines()), default=0)
