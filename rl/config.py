@@ -342,6 +342,18 @@ def parse_constants(texts: Sequence[str]) -> dict[str, Any]:
     return values
 
 
+def constants_text() -> str:
+    """Return the names that ``parse_constants`` reads, with their defaults without a preset."""
+    groups: dict[str, dict[str, Any]] = {"all agents": dict(NUMBERS)}
+    for name, default, agents in network_fields():
+        groups.setdefault(f"the networks of {' and '.join(agents)}", {})[name] = default
+    texts = (
+        f"{owner}: {', '.join(f'{name}={value:g}' for name, value in numbers.items())}"
+        for owner, numbers in groups.items()
+    )
+    return "; ".join(texts)
+
+
 def owners_of(name: str) -> tuple[str, ...]:
     """Return the agents whose networks have a number of a name; all agents for other numbers."""
     return next((agents for size, _, agents in network_fields() if size == name), tuple(AGENTS))

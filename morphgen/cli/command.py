@@ -318,6 +318,20 @@ class _BriefHelp(argparse._HelpAction):
         super().__call__(parser, *args, **options)
 
 
+class _FullHelp(argparse._HelpAction):
+    """Prints the help with the names of the hyperparameters, which loads PyTorch, and exits."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *args: Any, **options: Any) -> None:  # noqa: ANN401
+        for action in parser._actions:
+            if action.dest == "set":
+                try:
+                    names = import_module("morphgen.rl.config").constants_text()
+                except ImportError as error:
+                    names = f"names that need the extra rl: {error}"
+                action.help = f"{action.help}; of {names}"
+        super().__call__(parser, *args, **options)
+
+
 class _CommandAfterOptions(argparse._SubParsersAction):  # type: ignore[type-arg]  # not at run time
     """Chooses a command of a group that has options of its own.
 
@@ -378,7 +392,8 @@ def _add_options(parser: Parser, command: Command) -> None:
     if command.basic:
         text = "show the most used options and exit"
         parser.add_argument("-h", "--help", action=_BriefHelp, help=text)
-        parser.add_argument("--help-all", action="help", help="show all options and exit")
+        text = "show all options and exit"
+        parser.add_argument("--help-all", action=_FullHelp, help=text)
     exclusive = {
         name: group
         for names in command.alternatives

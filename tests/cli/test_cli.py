@@ -259,6 +259,8 @@ def test_the_help_of_a_first_use_is_short(capsys):
         shown.append(capsys.readouterr().out)
     assert all("--agent" in text and "--resume" in text for text in shown)
     assert ["--robots" in text and "--symlog" in text for text in shown] == [False, True]
+    for name in ("learning_rate=0.0003", "the networks of me-tf: ", "graph_hidden=64"):
+        assert [name in " ".join(text.split()) for text in shown] == [False, True]
 
 
 def test_definitions_name_functions_and_options_that_exist():

@@ -85,7 +85,7 @@ def test_invalid_requests_are_errors(text, message):
 
 
 def test_a_grammar_names_the_parameter_that_was_meant():
-    with pytest.raises(MorphgenError, match="no symbol 'claw_size'; did you mean 'claw.size'"):
+    with pytest.raises(MorphgenError, match=r"no symbol 'claw_size'; did you mean 'claw\.size'"):
         parse_words(["arm3", "claw_size=1"], LIBRARY)
 
 
