@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import morphgen
+from helpers.commands import WITHOUT_PROGRESS
 from helpers.simulators import needs_pybullet
 from morphgen.extras import EXTRAS
 
@@ -196,15 +197,15 @@ sys.meta_path[sys.meta_path.index(PathFinder)] = Without
 """
 
 
-def python_without_extras(folder, statements):
+def python_without_extras(folder, statements, *words):
     extras = [*EXTRAS, "pinocchio", "pybullet", "yourdfpy", "ray"]
     code = WITHOUT_EXTRAS.format(extras=extras) + statements
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder)
+    command = [sys.executable, "-c", code, *words]
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder)
 
 
 def run_without_extras(folder, *words):
-    statements = f"from morphgen.cli import main; sys.exit(main({list(words)}))"
-    return python_without_extras(folder, statements)
+    return python_without_extras(folder, WITHOUT_PROGRESS, *words)
 
 
 CORE_COMMANDS = (

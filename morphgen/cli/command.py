@@ -6,9 +6,10 @@ import argparse
 import math
 import re
 import shutil
+import sys
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -87,7 +88,8 @@ class Command:
         module, _, function = self.function.rpartition(".")
         from morphgen.cli.progress import status  # loads tqdm, which a help does not need
 
-        with status(args, "loading"):  # of packages, which takes seconds
+        # Packages, which take seconds; in a pipe the work itself says what it is.
+        with status(args, "loading") if sys.stderr.isatty() else nullcontext():
             run = getattr(import_module(f"morphgen.cli.{module}"), function)
         code: int | None = run(args)
         return code

@@ -14,10 +14,18 @@ def tree(folder):
     }
 
 
+WITHOUT_PROGRESS = """
+import sys
+from morphgen.cli import main, progress
+progress.FIRST_LINE = float("inf")  # on a busy machine all work is long, and would print lines
+sys.exit(main())
+"""
+
+
 def start(*argv, **environment):
     """Start ``morphgen`` with arguments and environment variables; its output is piped."""
     return subprocess.Popen(
-        [sys.executable, "-m", "morphgen", *map(str, argv)],
+        [sys.executable, "-c", WITHOUT_PROGRESS, *map(str, argv)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
