@@ -8,14 +8,13 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from tabulate import tabulate
-
 from morphgen.arguments import checked_signature
 from morphgen.benchmark.split_folder import read_split_or_folder
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import LibraryFolders, default_library
 from morphgen.model.robot import Robot
 from morphgen.splits.split_file import split_names
+from morphgen.tables import table
 from morphgen.tasks.goals.split_goals import (
     GoalResult,
     goal_record,
@@ -53,7 +52,7 @@ class GoalSets:
 
     def __str__(self) -> str:
         """Return a table with a row per robot, then a line per failure."""
-        lines = [tabulate([_row(each) for each in self.results], HEADERS, disable_numparse=True)]
+        lines = [table([_row(each) for each in self.results], HEADERS)]
         for result in self.results:
             robot = f"{result.side} robot" if result.side else "robot"
             if result.goals is None:

@@ -13,9 +13,9 @@ from morphgen.tasks.registry import Registry
 ROBOT = {"words": "robot"}
 ROBOTS = {"words": "robots"}
 OPERATIONS = {
-    "conform": ("conform", ROBOT, {"root", "json"}),
-    "eval": ("evaluate", ROBOTS | {"checkpoint": "policy"}, {"out", "json"}),
-    "goals": ("goals", ROBOTS, {"json"}),
+    "conform": ("conform", ROBOT, {"root", "json", "wide"}),
+    "eval": ("evaluate", ROBOTS | {"checkpoint": "policy"}, {"out", "json", "wide"}),
+    "goals": ("goals", ROBOTS, {"json", "wide"}),
     "play": ("play", ROBOT, set()),
     "train": ("train", ROBOTS, {*SWITCHES, "observe"}),
 }
