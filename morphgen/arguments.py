@@ -8,6 +8,7 @@ from functools import wraps
 from numbers import Integral
 from os import PathLike
 from pathlib import Path
+from types import SimpleNamespace
 from typing import ParamSpec, TypeVar
 
 from morphgen.errors import MorphgenError, SignatureError
@@ -59,6 +60,19 @@ def whole_number(
         valid = "a whole number" if least is None else f"a whole number, {least} or more"
         raise error(f"{name} {value!r}: expected {valid}")
     return int(value)  # type: ignore[call-overload,no-any-return]
+
+
+def require_types(
+    given: SimpleNamespace, error: type[MorphgenError], *texts: str, **least: int
+) -> None:
+    """Require that arguments by name are texts, and others whole numbers of a least value, or None.
+
+    Whole numbers become ``int``.
+    """
+    for name in (each for each in texts if getattr(given, each) is not None):
+        text_argument(name, getattr(given, name), error)
+    for name in (each for each in least if getattr(given, each) is not None):
+        setattr(given, name, whole_number(name, getattr(given, name), error, least[name]))
 
 
 def truth(name: str, value: object, error: type[MorphgenError]) -> bool:

@@ -279,6 +279,25 @@ make_env("reach", [], num_envs=2) => expected at least one robot
 make_env("reach", num_envs=2, config=3) => unknown option 'config'
 make_env("reach", num_envs=2, autoreset_mode="Disabled") => autoreset_mode Disabled: expected SAME_S
 prims_env(num_envs=0) => 0 environments
+train("prims") => prims: no such file, and no split of this name
+train("prims task=rich") => unknown task 'rich'
+train("prims task=reach", seed=-1) => seed -1: expected a whole number, 0 or more
+train("prims task=reach", steps="9") => steps '9': expected a whole number, 1
+train("prims task=reach", sim="mujco") => did you mean 'mujoco'
+train("prims task=reach", agent=None, sim=3) => sim 3: expected a text
+train("prims task=reach", constants={"gama": 1}) => did you mean 'gamma'
+train("prims task=reach", robot_seed=1) => only with drawn
+evaluate("ik", "prims task=reach", mode="best") => unknown mode 'best'; valid: deter
+evaluate("ik", "prims task=reach", episodes=0) => episodes 0: expected a whole num
+evaluate("zero-shot", goal_seed=1) => goal_seed and library: only with robots
+evaluate("zero-shot", method="mine") => method: only with submission
+evaluate("zero-shot", "prims task=reach", on="tests") => unknown side 'tests'
+play("reach", "prims", episodes=0) => episodes 0: expected a whole number, 1
+play("push", "prims", policy="ik") => valid: scripted, zero, random
+play("reach", "prims", kind="binary") => binary
+goals("prims", task="reech") => did you mean 'reach'
+goals("arm=ur5 ee=stick") => name one split, or say --task for a robot
+goals("interpolation/arm3/reach", obstacles=True) => obstacles: only with task
 """
 """Calls of public functions that are refused, and part of the reason."""
 
@@ -310,6 +329,11 @@ NOT_TEXTS = (5, None, [3], {}, 1.5, b"x", object())
         lambda value: morphgen.similarity(value),
         lambda value: morphgen.similarity(["prims", "z1-plane"], [value]),
         lambda value: morphgen.check(value),
+        lambda value: morphgen.train(value),
+        lambda value: morphgen.train("prims task=reach", agent=5 if value is None else value),
+        lambda value: morphgen.evaluate(value),
+        lambda value: morphgen.play(value, "prims"),
+        lambda value: morphgen.goals(value),
     ],
 )
 def test_values_that_are_no_texts_give_one_clear_error(call):

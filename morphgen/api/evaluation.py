@@ -13,7 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from morphgen.api.training import named_source, with_goal
-from morphgen.arguments import checked_signature, path_argument
+from morphgen.arguments import checked_signature, path_argument, require_types, text_argument
 from morphgen.benchmark.eval_protocol import EvalProtocol, protocol_from
 from morphgen.benchmark.release import is_release, read_release
 from morphgen.benchmark.scores.submission import (
@@ -61,7 +61,7 @@ from morphgen.rl.runs.robot_source import (
 from morphgen.rl.runs.training import checkpoint_files
 from morphgen.rl.scores import Evaluation, Score
 from morphgen.rl.shipped_policies import checkpoint_path, is_named
-from morphgen.splits.split import Side
+from morphgen.splits.split import Side, require_side
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, require_device
 from morphgen.tasks.render.renderer import require_video_path, write_video
@@ -130,6 +130,10 @@ def evaluate(
         MorphgenError: If a split or a robot cannot be read, or a robot cannot do the task.
     """
     given = SimpleNamespace(**locals())
+    least = {"episodes": 1, "steps": 1, "workers": 1, "seed": 0, "goal_seed": 0}
+    require_types(given, TaskError, "sim", "device", "goal", "method", **least)
+    if on is not None:
+        require_side(on)
     if mode not in (None, *MODES):
         raise TaskError(f"unknown mode {mode!r}{nearest(str(mode), MODES)}")
     if robots is None and (obstacles or goal_seed is not None or library_folders(library)):
@@ -193,7 +197,9 @@ def play(
         TaskError: If the policy is not for the task, or an argument is invalid.
         MorphgenError: If the robot cannot be read, or cannot do the task.
     """
-    spec = read_controller(str(policy), task)
+    given = SimpleNamespace(**locals())
+    require_types(given, TaskError, "sim", "goal", "kind", episodes=1, seed=0)
+    spec = read_controller(str(policy), text_argument("task", task, TaskError))
     video = None if out is None else path_argument("out", out, TaskError)
     if video is not None:
         require_video_path(video)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
-from morphgen.arguments import checked_signature
+from morphgen.arguments import checked_signature, path_argument, text_argument
 from morphgen.benchmark.split_folder import read_split_or_folder
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import LibraryFolders, default_library
@@ -21,6 +20,7 @@ from morphgen.tasks.goals.split_goals import (
     sample_robot_goals,
     sample_split_goals,
 )
+from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig, load_robot
 
 HEADERS = ("robot", "side", "task", "goals", "acceptance", "obstacles", "certified")
@@ -119,16 +119,20 @@ def goals(
     """
     config = GoalConfig(seed)
     if task is not None:
+        TASKS[text_argument("task", task, BenchmarkError)]  # raises if the task is unknown
         if str(robots) in split_names():
             raise BenchmarkError(f"--task {task}: is for a robot; {robots} is a split")
         robot = load_robot(robots, library=library)
         result = sample_robot_goals(robot, task, config, obstacles=obstacles, certified=certify)
         return GoalSets(seed, (result,))
-    if isinstance(robots, Robot) or (len(str(robots).split()) > 1 and not Path(robots).exists()):
-        raise BenchmarkError(f"{robots}: name one split, or say --task for a robot")
+    if isinstance(robots, Robot):
+        raise BenchmarkError(f"{robots!r}: name its task")
+    path = path_argument("robots", robots, BenchmarkError)
+    if len(str(path).split()) > 1 and not path.exists():
+        raise BenchmarkError(f"{path}: name one split, or say --task for a robot")
     if obstacles:
         raise BenchmarkError("obstacles: only with task")
-    split, _ = read_split_or_folder(robots)
+    split, _ = read_split_or_folder(path)
     results = sample_split_goals(
         split, default_library(library), config, jobs=jobs, certified=certify
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from morphgen.arguments import checked_signature
+from morphgen.arguments import checked_signature, require_types
 from morphgen.benchmark.split_folder import read_split_or_folder
 from morphgen.encoding.tokens import default_max_links, require_max_links
 from morphgen.errors import BenchmarkError, TaskError
@@ -44,7 +44,7 @@ from morphgen.rl.runs.training import (
     require_runnable,
 )
 from morphgen.rl.runs.training import train as train_parts
-from morphgen.splits.split import Side
+from morphgen.splits.split import Side, require_side
 from morphgen.splits.split_file import read_split
 from morphgen.tasks.goals.split_goals import has_goals, read_split_goals
 from morphgen.tasks.reach.config import ReachConfig
@@ -180,6 +180,11 @@ def train(
         MorphgenError: If a split or a robot cannot be read, or a robot cannot do the task.
     """
     given = SimpleNamespace(**locals())
+    texts = ("agent", "preset", "sim", "device", "drawn", "goal", "geometry")
+    least = {"minutes": 1, "robot_seed": 0, "slice_updates": 1, "train_goals": 2, "max_links": 2}
+    least |= {"steps": 1, "envs": 1, "workers": 1, "seed": 0, "goal_seed": 0}
+    require_types(given, TaskError, *texts, **least)
+    require_side(on)
     simulator = sim or DEFAULT_SIMULATOR
     require_simulator_device(simulator, batch_device(simulator, device))
     spec = parse_agent(agent)
