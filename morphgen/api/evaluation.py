@@ -25,6 +25,8 @@ from morphgen.benchmark.scores.submission import (
 from morphgen.errors import TaskError, nearest
 from morphgen.formats.files import require_writable_file, write_file
 from morphgen.grammar.library import LibraryFolders, library_folders
+from morphgen.grammar.robot_source import RobotLike
+from morphgen.model.robot import Robot
 from morphgen.progress import note, stage
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.evaluation import (
@@ -140,19 +142,20 @@ def evaluate(
         raise TaskError("obstacles, goal_seed and library: only with robots")
     if submission is None and method is not None:
         raise TaskError("method: only with submission")
-    if str(policy) in BASELINES:
-        scores = _baseline_scores(given)
-    else:
-        if submission is not None:
-            given.mode = mode or "deterministic"
-        scores = _policy_scores(given)
+    is_baseline = str(policy) in BASELINES
+    longest = max(config.max_episode_steps for config in default_configs())
+    given.episodes = episodes or episodes_for(steps, longest)
+    if submission is not None:
+        given.sim = sim or _rules_of(robots).simulator
+        given.mode = mode or (None if is_baseline else "deterministic")
+    scores = (_baseline_scores if is_baseline else _policy_scores)(given)
     return Evaluation({name: tuple(each) for name, each in scores.items()})
 
 
 @checked_signature
 def play(
     task: str,
-    robot: str | PathLike[str],
+    robot: RobotLike,
     *,
     policy: str | PathLike[str] = "random",
     out: str | PathLike[str] | None = None,
@@ -169,13 +172,13 @@ def play(
     """Run a controller on one robot, and render a video.
 
     Examples:
-        >>> (episode,) = morphgen.play("reach", "arm3-stick", policy="ik")
+        >>> (episode,) = morphgen.play("reach", morphgen.compose("arm3-stick"), policy="ik")
         >>> episode.success, episode.distance < 0.03
         (True, True)
 
     Args:
         task: Name of the task, such as ``reach`` or ``push``.
-        robot: Words of ``compose``, parts joined by dashes, a bundle's folder or a description.
+        robot: The robot, its bundle's folder, a description, or words of ``compose``.
         policy: The controller: a baseline such as ``random`` or ``ik``, a policy that comes with
             morphgen, such as ``zero-shot``, a checkpoint, or a run folder.
         out: The video, a file that ends in ``.mp4`` or ``.gif``.
@@ -206,7 +209,7 @@ def play(
     (config,) = with_goal([spec.task_config], goal, [task])
     env, controller = make_env_and_controller(
         spec,
-        str(robot),
+        robot if isinstance(robot, Robot) else str(robot),
         seed,
         kind=kind,
         sim=sim,
@@ -276,8 +279,8 @@ def _baseline_scores(given: SimpleNamespace) -> dict[str, list[Score]]:
         raise TaskError(f"{option} is for policies; {name} has none")
     sources = _sources(given)
     config = EvalConfig(
-        _num_episodes(given),
-        _simulator(given) or DEFAULT_SIMULATOR,
+        given.episodes,
+        given.sim or DEFAULT_SIMULATOR,
         given.seed,
         given.workers,
         _with_goal(default_configs(), sources, given),
@@ -311,12 +314,12 @@ def _policy_scores(given: SimpleNamespace) -> dict[str, list[Score]]:
             )
     if len(files) > 1:  # a policy for each robot: their seeds and budgets are parts of the run's
         run = read_config(path)
-    config = eval_config_of(run, _num_episodes(given), seed=given.seed, workers=given.workers)
+    config = eval_config_of(run, given.episodes, seed=given.seed, workers=given.workers)
     others = _other_robots(given, run, files[0].parent, config)
     sources = others or [run.source]
     require_trained_tasks(run, sources, name)
     tasks = _with_goal(config.tasks, sources, given)
-    config = replace(config, sim=_simulator(given) or config.sim, tasks=tasks)
+    config = replace(config, sim=given.sim or config.sim, tasks=tasks)
     write = _plan_submission(
         given,
         sources[0],
@@ -359,13 +362,6 @@ def _other_robots(
     return [fresh]
 
 
-def _simulator(given: SimpleNamespace) -> str | None:
-    """Return the simulator that is asked for, or that of a submission's rules; None for neither."""
-    if given.sim is None and given.submission is not None:
-        return _rules_of(given.robots).simulator
-    return None if given.sim is None else str(given.sim)
-
-
 def _warn_of_drawn(folder: Path, sources: list[Source]) -> None:
     """Say which of the robots to evaluate were among the drawn robots of a run."""
     if not (folder / FILE).is_file():
@@ -393,10 +389,3 @@ def _with_goal(
 ) -> tuple[TaskConfig, ...]:
     """Return configs with the goal of the given, which must be for a robot of the sources."""
     return with_goal(configs, given.goal, (task for each in sources for task in tasks_of(each)))
-
-
-def _num_episodes(given: SimpleNamespace) -> int:
-    if given.episodes is not None:
-        return int(given.episodes)
-    longest = max(config.max_episode_steps for config in default_configs())
-    return episodes_for(given.steps, longest)
