@@ -12,6 +12,7 @@ import copy
 import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import chain
 from typing import Any, ParamSpec, TypeVar
@@ -128,6 +129,7 @@ def next_actor_lr_scale(config: PPOConfig, scale: float, kl: float) -> float:
 
 MAX_COMPILED = 64  # functions and input shapes that a process may compile
 
+LossOf = Callable[[Observation, Mapping[str, torch.Tensor], torch.Tensor], tuple[torch.Tensor, ...]]
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -167,8 +169,14 @@ def prepared(
     return call
 
 
-LOSS_METRICS = ("policy_loss", "value_loss", "entropy", "kl", "clip_fraction")
-LEARN_METRICS = (*LOSS_METRICS, "actor_gradient", "critic_gradient", "explained_variance")
+ACTOR_METRICS = ("policy_loss", "entropy", "kl", "clip_fraction")
+LEARN_METRICS = (
+    *ACTOR_METRICS,
+    "value_loss",
+    "actor_gradient",
+    "critic_gradient",
+    "explained_variance",
+)
 """Metrics of the gradient steps of an update; see ``UpdateMetrics``."""
 
 
@@ -214,6 +222,7 @@ class Learner:
             eps=config.adam_epsilon,
             fused=True,
         )
+        self._helper = ThreadPoolExecutor(1, "critic")
         self.actor_lr_scale = 1.0
         self.generators = {
             name: torch.Generator(self.device).manual_seed(stream)
@@ -223,7 +232,7 @@ class Learner:
         ready = partial(prepared, device=self.device, bf16=config.bf16, compiled=config.compile)
         self._run_actor = ready(self.actor)
         self._run_critic = ready(self.target_critic if config.slow_critic else self.critic)
-        self._run_loss = ready(self._loss)
+        self._run_losses = ready(self._actor_loss), ready(self._critic_loss)
 
         # The rollout, (T, n, ...). What the networks read and write is on the learner's device.
         obs, T, n = self._network_input(observation), config.num_steps, batch.num_envs
@@ -433,8 +442,7 @@ class Learner:
                 obs = {name: value[rows] for name, value in observations.items()}
                 minibatch = {name: value[rows] for name, value in transitions.items()}
                 self.optimiser.zero_grad(set_to_none=True)
-                loss, loss_metrics = self._run_loss(obs, minibatch, self._robot_weights())
-                loss.backward()  # type: ignore[no-untyped-call]
+                losses = self._add_gradients(obs, minibatch, self._robot_weights())
                 self.processes.average_gradients(
                     chain(self.actor.parameters(), self.critic.parameters())
                 )
@@ -445,7 +453,7 @@ class Learner:
                 ]
                 self.optimiser.step()
                 ema_update(self.target_critic, self.critic, config.slow_decay)
-                metrics.append(torch.stack([*loss_metrics, *norms]))
+                metrics.append(torch.stack([*losses, *norms]))
 
         if self.actor.normalizer is not None:
             self.actor.normalizer.update(observations, self.processes)
@@ -459,29 +467,49 @@ class Learner:
         self.actor_lr_scale = next_actor_lr_scale(config, self.actor_lr_scale, means["kl"])
         return {**means, "learning_rate": actor_group["lr"]}
 
-    def _loss(
-        self,
-        observations: Observation,
-        minibatch: Mapping[str, torch.Tensor],
-        robot_weights: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the loss of a minibatch, shape (), and its ``LOSS_METRICS``, shape (5,).
+    def _add_gradients(
+        self, obs: Observation, minibatch: Mapping[str, torch.Tensor], robot_weights: torch.Tensor
+    ) -> torch.Tensor:
+        """Add the gradients of a minibatch; return ``ACTOR_METRICS`` and the value loss, (5,).
 
         Observations and the other facts of the transitions have the shape (m, ...), weights (R,).
         """
-        head = self.actor.distribution(observations)
+        weights = robot_weights[minibatch["robot"]]
+
+        def add(loss_of: LossOf) -> torch.Tensor:
+            loss, metrics = loss_of(obs, minibatch, weights)
+            loss.backward()  # type: ignore[no-untyped-call]
+            return metrics.clone()  # the next call of a CUDA graph overwrites its output
+
+        of_actor, of_critic = self._run_losses
+        if not is_host(self.device):
+            return torch.cat([add(of_actor), add(of_critic)])
+        # The networks share nothing, and torch computes without Python's lock.
+        critic = self._helper.submit(add, of_critic)
+        return torch.cat([add(of_actor), critic.result()])
+
+    def _actor_loss(
+        self, obs: Observation, minibatch: Mapping[str, torch.Tensor], weights: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the actor's loss, shape (), and ``ACTOR_METRICS``, shape (4,)."""
+        head = self.actor.distribution(obs)
         log_ratio = head.log_prob(minibatch["action"]) - minibatch["log_prob"]
         policy = policy_loss(log_ratio, minibatch["advantage"], self.config.clip_coef)
         entropy = joint_entropy(head) if self.config.joint_entropy else head.entropy()
-        value_error = matching_loss if self.config.symlog else half_square
-        value = value_error(self.critic(observations), minibatch["return"])
-        weights = robot_weights[minibatch["robot"]]
-        loss = (weights * (policy - self.config.ent_coef * entropy + value)).mean()
+        loss = (weights * (policy - self.config.ent_coef * entropy)).mean()
         ratio = log_ratio.exp()
         kl = ratio - 1 - log_ratio  # Schulman 2020, estimator k3
         clipped = ((ratio - 1).abs() > self.config.clip_coef).float()
-        metrics = (policy, value, entropy, kl, clipped)
+        metrics = (policy, entropy, kl, clipped)
         return loss, torch.stack([metric.mean() for metric in metrics]).detach()
+
+    def _critic_loss(
+        self, obs: Observation, minibatch: Mapping[str, torch.Tensor], weights: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the critic's loss, shape (), and its mean without weights, shape (1,)."""
+        error_of = matching_loss if self.config.symlog else half_square
+        error = error_of(self.critic(obs), minibatch["return"])
+        return (weights * error).mean(), error.mean()[None].detach()
 
     def _robot_weights(self) -> torch.Tensor:
         """Return the weight of each robot's transitions, shape (R,), mean 1.

@@ -26,6 +26,7 @@ from morphgen.formats.files import locked_folder, naming, write_atomic
 from morphgen.formats.records import read_record
 from morphgen.model.kinematics import driving_joints
 from morphgen.model.robot import TOOL, Robot
+from morphgen.processes import one_torch_thread
 from morphgen.progress import show_progress
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import PPOConfig, differences, policy_from
@@ -408,7 +409,7 @@ def train(
     unfinished = [part for part in parts if not is_done(part)]
     if unfinished:  # a finished run is evaluated on machines without its GPU
         require_device(config.device)
-    with _StopRequest(execution.minutes) as stop, ExitStack() as held:
+    with _StopRequest(execution.minutes) as stop, ExitStack() as held, one_torch_thread():
         processes, device = held.enter_context(process_group(config.device))
         holds = False
         for part in unfinished:

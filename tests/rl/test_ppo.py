@@ -165,8 +165,8 @@ def test_returns_by_hand(slow, logarithmic):
 
 def test_each_epoch_has_every_transition_in_one_minibatch():
     trainer, seen = learner(epochs=3), []
-    loss = trainer._run_loss
-    trainer._run_loss = lambda obs, data, w: seen.append((obs, data)) or loss(obs, data, w)
+    loss, other = trainer._run_losses
+    trainer._run_losses = lambda obs, data, w: seen.append((obs, data)) or loss(obs, data, w), other
     trainer.iterate()
     assert [len(data["return"]) for _, data in seen] == [16] * 12
 
@@ -230,14 +230,20 @@ def test_robot_weights_are_one_or_random_with_mean_one():
 
 def test_a_robot_of_weight_zero_does_not_change_the_loss():
     trainer, seen = learner(epochs=1, minibatches=1, task_reweighting=True), []
-    loss = trainer._run_loss
-    trainer._run_loss = lambda obs, data, w: seen.append((obs, data)) or loss(obs, data, w)
+    of_actor, of_critic = trainer._run_losses
+    trainer._run_losses = (
+        lambda obs, data, w: seen.append((obs, data)) or of_actor(obs, data, w),
+        of_critic,
+    )
     trainer.iterate()
     ((obs, data),) = seen
-    other = data | {"return": data["return"] + 9.0 * (data["robot"] == 1)}
+    changed = {"advantage": 9.0, "return": 9.0}
+    other = data | {name: data[name] + by * (data["robot"] == 1) for name, by in changed.items()}
     for robot_weights, same in (([2.0, 0.0], True), ([1.0, 1.0], False)):
-        losses = [loss(obs, each, torch.tensor(robot_weights))[0] for each in (data, other)]
-        assert losses[0].equal(losses[1]) == same
+        weights = torch.tensor(robot_weights)[data["robot"]]
+        for loss in (of_actor, of_critic):
+            losses = [loss(obs, each, weights)[0] for each in (data, other)]
+            assert losses[0].equal(losses[1]) == same
 
 
 def test_a_batch_of_other_actions_is_rejected():
