@@ -3,6 +3,7 @@
     python benchmarks/ppo_speed.py [--robot ur5-plane] [--envs 64] [--rounds 3] [--threads 1,2]
         [--sims pybullet,mujoco] [--json rows.json]
     python benchmarks/ppo_speed.py --device cuda [--envs 128] [--rounds 3] [--json rows.json]
+    python benchmarks/ppo_speed.py --cores 1,2,4 [--agents me-graph] [--sims mujoco] [--rounds 5]
 
 A row is one update: a rollout of 128 control steps in every environment, and four epochs of 16
 minibatches. Within a simulator and number of threads all rows share:
@@ -31,6 +32,11 @@ With ``--device`` the script measures only the learner: ``me-tf`` learns from ra
 bfloat16 and ``torch.compile`` on and off. Samples per second are transitions times epochs divided
 by the learning time. No simulator is needed.
 
+With ``--cores`` the script compares the threads that ``morphgen train`` uses by default with
+others: torch threads and workers of the simulator, one or one for each core, on the first cores
+that it may use, idle and beside a process on each core that computes without end. Each figure is
+the median of the updates of a process of its own, in transitions per second.
+
 stable-baselines3 comes with `pip install morphgen[bench]`; without it its rows are missing.
 """
 
@@ -40,10 +46,11 @@ import argparse
 import json
 import os
 import statistics
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from functools import partial
 from importlib.util import find_spec
 from itertools import product
@@ -62,7 +69,7 @@ from morphgen.rl.observation_layout import INITIAL_LOG_STD, layout_of
 from morphgen.rl.ppo import Learner
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step, TaskBatch
-from morphgen.tasks.observation import Observation
+from morphgen.tasks.observation import Observation, observation_config
 
 Update = Callable[[], tuple[float, float]]
 """Run one update; return the seconds of collection and of learning."""
@@ -88,8 +95,19 @@ def main() -> int:
     parser.add_argument("--sims", default="pybullet,mujoco")
     parser.add_argument("--device", help="measure the learner alone, on cuda or cpu")
     parser.add_argument("--json", type=Path, help="also write the rows here")
+    parser.add_argument("--cores", help="numbers of cores, parted by commas: compare threads")
+    parser.add_argument("--agents", default="me-graph,se", help="agents of --cores")
+    parser.add_argument("--one", nargs=4, help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.device:
+    if args.one:
+        agent, sim, *numbers = args.one
+        print(_speed(args.robot, agent, sim, args.envs, args.rounds, *map(int, numbers)))
+        return 0
+    if args.cores:
+        counts = [int(text) for text in args.cores.split(",")]
+        cases = product(args.agents.split(","), args.sims.split(","), counts, (False, True))
+        rows = [_threads(args, *case) for case in tqdm(list(cases), unit="case")]
+    elif args.device:
         rows = _learners(args.device, args.envs, args.rounds)
     else:
         threads = dict.fromkeys(int(text) for text in args.threads.split(","))
@@ -101,9 +119,67 @@ def main() -> int:
     if args.json:
         args.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     print(tabulate(rows, headers="keys", floatfmt=",.2f"))
-    if not args.device and find_spec("stable_baselines3") is None:
+    if not (args.device or args.cores) and find_spec("stable_baselines3") is None:
         print("stable-baselines3 is not installed: no peer (pip install 'morphgen[bench]')")
     return 0
+
+
+def _threads(args: argparse.Namespace, agent: str, sim: str, count: int, loaded: bool) -> Row:
+    """Return the speed with the threads of ``morphgen train`` and with the best of others."""
+    cores = sorted(os.sched_getaffinity(0))[:count]
+    pairs = [(0, 0), *dict.fromkeys(product((1, count), repeat=2))]
+    speeds: dict[tuple[int, int], float] = {}
+    with ExitStack() as stack:
+        for core in cores if loaded else ():
+            busy = subprocess.Popen(
+                [sys.executable, "-c", "while True: pass"],
+                preexec_fn=partial(os.sched_setaffinity, 0, [core]),
+            )
+            stack.callback(busy.wait)
+            stack.callback(busy.kill)
+        for torch_threads, workers in pairs:
+            words = map(str, ("--one", agent, sim, torch_threads, workers, "--robot", args.robot))
+            sizes = map(str, ("--envs", args.envs, "--rounds", args.rounds))
+            done = subprocess.run(
+                [sys.executable, __file__, *words, *sizes],
+                preexec_fn=partial(os.sched_setaffinity, 0, cores),
+                check=True,
+                text=True,
+                stdout=subprocess.PIPE,
+            )
+            speeds[torch_threads, workers] = float(done.stdout)
+    default = speeds.pop((0, 0))
+    best = max(speeds, key=speeds.__getitem__)
+    return {
+        "agent": agent,
+        "sim": sim,
+        "cores": count,
+        "other load": "one process a core" if loaded else "none",
+        "default": default,
+        "best": speeds[best],
+        "torch threads": best[0],
+        "workers": best[1],
+        "default / best": default / max(speeds.values()),
+    }
+
+
+def _speed(
+    robot: str, agent: str, sim: str, envs: int, rounds: int, torch_threads: int, workers: int
+) -> float:
+    """Return transitions per second of a learner; 0 stands for the threads of ``train``."""
+    from morphgen.tasks.scenes.env_specs import load_robot
+    from morphgen.tasks.scenes.make import make_batch
+
+    torch.set_num_threads(torch_threads or 1)
+    policy = PolicyConfig(agent, discrete=False)
+    options = {"kind": policy.kind, "observe": observation_config(policy.channels)}
+    batch = make_batch(
+        "reach", [load_robot(robot)], envs, sim=sim, workers=workers or None, **options
+    )
+    with closing(batch):
+        learner = Learner(batch, policy, PPOConfig(total_timesteps=10**9))
+        learner.iterate()
+        return statistics.median(learner.iterate().steps_per_second for _ in range(rounds))
 
 
 def _beside(robot: str, sim: Any, envs: int, threads: int, rounds: int) -> Iterator[Row]:  # noqa: ANN401

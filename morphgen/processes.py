@@ -13,9 +13,10 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from ctypes import c_byte
 from multiprocessing import get_context, parent_process, resource_tracker
+from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -33,6 +34,8 @@ POLL_INTERVAL = 0.2
 was received [s]."""
 STOP_SIGNALS = (signal.SIGTERM, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()))
 """Signals that stop a command as Ctrl-C does: of a service manager, of a closed terminal."""
+CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
+"""File in which Linux tells a container how much of the cores it may use."""
 RAY_TIMEOUT = 5.0
 """Longest wait for the address of a Ray cluster [s]; Ray itself waits for minutes."""
 
@@ -41,6 +44,16 @@ _stopped: c_byte | None = None
 """Flag that the parent has stopped, in memory that all its processes share."""
 _is_working = False
 _is_starting = False
+
+
+def usable_cores() -> int:
+    """Return the number of cores that this process may use, by its affinity and its cgroup."""
+    has_affinity = hasattr(os, "sched_getaffinity")
+    cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
+    with suppress(OSError, ValueError):  # no cgroups of version 2, or "max": no limit
+        quota, period = map(int, CPU_LIMIT.read_text().split())
+        cores = min(cores, -(-quota // period))
+    return cores
 
 
 def parallel_map(

@@ -60,7 +60,7 @@ class EvalConfig:
     episodes: int = 34  # minimum number of complete episodes per robot
     sim: str = DEFAULT_SIMULATOR  # name of the simulator
     seed: int = 0  # seed of the episodes
-    workers: int = 1
+    workers: int | None = None
     """Number of PyBullet processes, or of MuJoCo threads; scores do not depend on it."""
     tasks: tuple[TaskConfig, ...] = field(default_factory=default_configs)
     """Configs of tasks; other tasks have their defaults."""
@@ -273,7 +273,7 @@ def _score(
 
 
 def eval_config_of(
-    config: RunConfig, episodes: int, *, seed: int = 0, workers: int = 1
+    config: RunConfig, episodes: int, *, seed: int = 0, workers: int | None = None
 ) -> EvalConfig:
     """Return the config to evaluate a run in its tasks, and its simulator if that has contacts."""
     sim = evaluation_simulator(config.sim)

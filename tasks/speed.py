@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from morphgen.processes import one_torch_thread
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.sim.base import SUBSTEPS, is_host
@@ -42,6 +43,7 @@ def random_actions(batch: TaskBatch, count: int, seed: int) -> list[torch.Tensor
     return list(drawn.to(batch.device).unbind(0))
 
 
+@one_torch_thread()
 def measure_speed(
     batch: TaskBatch,
     seconds: float,

@@ -56,7 +56,7 @@ class VectorOptions(SharedOptions, total=False):
     configs: Sequence[TaskConfig]
     seed: int | None
     autoreset_mode: str
-    workers: int
+    workers: int | None
     device: str
 
 

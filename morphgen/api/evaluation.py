@@ -27,6 +27,7 @@ from morphgen.formats.files import require_writable_file, write_file
 from morphgen.grammar.library import LibraryFolders, library_folders
 from morphgen.grammar.robot_source import RobotLike
 from morphgen.model.robot import Robot
+from morphgen.processes import usable_cores
 from morphgen.progress import note, stage
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.evaluation import (
@@ -80,7 +81,7 @@ def evaluate(
     episodes: int | None = None,
     steps: int = 10_000,
     sim: str | None = None,
-    workers: int = 1,
+    workers: int | None = None,
     device: str = "cpu",
     seed: int = 0,
     obstacles: bool = False,
@@ -112,7 +113,8 @@ def evaluate(
         episodes: Least number of episodes per robot.
         steps: Number of control steps per robot, in episodes of full length, without ``episodes``.
         sim: Name of the simulator, by default that of the training.
-        workers: Number of processes of PyBullet, or of threads of MuJoCo.
+        workers: Number of processes of PyBullet, or of threads of MuJoCo; by default as many as
+            the environments and the cores allow.
         device: Device of the networks: ``cpu`` or ``cuda``.
         seed: Seed of the episodes.
         obstacles: Whether one robot is among obstacles.
@@ -357,7 +359,9 @@ def _other_robots(
             f"--on train: {run.source.name} has no split; its policy is scored on fresh robots"
         )
     goals = GoalConfig(tasks=_with_goal(config.tasks, [run.source], given))
-    fresh, line = fresh_source(folder, run.source, goals, given.seed, jobs=given.workers)
+    fresh, line = fresh_source(
+        folder, run.source, goals, given.seed, jobs=given.workers or usable_cores()
+    )
     note(f"morphgen: {line}")
     return [fresh]
 

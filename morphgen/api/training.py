@@ -15,6 +15,7 @@ from morphgen.benchmark.split_folder import read_split_or_folder
 from morphgen.encoding.tokens import default_max_links, require_max_links
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.grammar.library import LibraryFolders, library_folders
+from morphgen.processes import usable_cores
 from morphgen.progress import note
 from morphgen.rl.agents import AGENTS, preset_of
 from morphgen.rl.config import AgentSpec, configs_of, owners_of, parse_agent, parse_constants
@@ -96,7 +97,7 @@ def train(
     steps: int | None = None,
     envs: int | None = None,
     sim: str | None = None,
-    workers: int = 1,
+    workers: int | None = None,
     device: str = "cpu",
     seed: int = 0,
     out: str | PathLike[str] | None = None,
@@ -144,7 +145,8 @@ def train(
         steps: Number of control steps of all environments together; by default the preset's.
         envs: Number of environments, which the robots share; by default the preset's.
         sim: Name of the simulator, by default ``mujoco``.
-        workers: Number of processes of PyBullet, or of threads of MuJoCo.
+        workers: Number of processes of PyBullet, or of threads of MuJoCo; by default as many as
+            the environments and the cores allow.
         device: Device of the networks: ``cpu`` or ``cuda``.
         seed: Seed of weights, actions and episodes.
         out: Folder of the run, by default ``runs/SPLIT/AGENT/seedN``.
@@ -385,7 +387,7 @@ def _with_drawn_robots(
     slice_updates = given.slice_updates or default_slice_updates(config)
     config = replace(config, slice_updates=slice_updates)
     require_runnable(config)
-    robots = draw(source, GoalConfig(tasks=config.tasks), jobs=given.workers)
+    robots = draw(source, GoalConfig(tasks=config.tasks), jobs=given.workers or usable_cores())
     if robots.skipped:
         reasons = ", ".join(f"{count} {reason}" for reason, count in robots.skipped.items())
         note(f"morphgen: robots that were skipped: {reasons}")
@@ -409,7 +411,7 @@ def train_run(folder: Path, config: RunConfig, given: SimpleNamespace) -> Traini
     """Say what is trained, and train to the end of the run, or until it is stopped."""
     workers = given.workers
     if isinstance(config.source, GrammarSource) and not SIMULATORS[config.sim].takes_workers:
-        workers = 1  # the others have drawn the robots
+        workers = None  # the others have drawn the robots
     parts = train_parts(
         folder,
         config,

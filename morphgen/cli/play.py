@@ -55,13 +55,14 @@ def play(args: argparse.Namespace) -> None:
 def speed(args: argparse.Namespace) -> None:
     """Measure the speed and print it."""
     robot, sim = " ".join(args.words), args.sim or DEFAULT_SIMULATOR
+    workers = args.workers or SIMULATORS[sim].default_workers(args.envs)
     with bar(args, f"preparing {robot} and its goals"):
         batch = make_batch(
             args.task,
             [robot],
             args.envs,
             sim=sim,
-            workers=args.workers,
+            workers=workers,
             device=args.device or SIMULATORS[sim].devices[0],
             obstacles=args.obstacles,
             max_links=None,
@@ -70,14 +71,14 @@ def speed(args: argparse.Namespace) -> None:
     with closing(batch), status(args, "measuring"):
         step = SIMULATORS[sim].native_step
         # Other processes would not be timed.
-        native_steps = [(import_module(step[0]), step[1])] if step and args.workers == 1 else []
+        native_steps = [(import_module(step[0]), step[1])] if step and workers == 1 else []
         result = measure_speed(batch, args.seconds, own=native_steps)
 
     def text() -> str:
         shares = [(part, f"{share:.1%}") for part, share in result.shares.items()]
         return (
             f"{args.task}, {batch.specs[0].robot.name}, {args.envs} environments, {sim}, "
-            f"{batch.device.type}, {args.workers} worker(s)\n"
+            f"{batch.device.type}, {workers} worker(s)\n"
             f"environment steps per second: {result.steps_per_second:,.0f}\n"
             f"physics steps per second:     {result.substeps_per_second:,.0f}\n"
             f"{tabulate(shares)}"

@@ -14,6 +14,7 @@ from platformdirs import user_cache_path
 
 import morphgen
 from morphgen.doctor import Entry, attempt
+from morphgen.processes import usable_cores
 
 NOT_FOR_USERS = frozenset(("all", "bench", "dev", "docs", "test"))
 """Extras that the diagnosis leaves out: a sum of others, and those for work on morphgen itself."""
@@ -42,7 +43,7 @@ def _python() -> Entry:
 
 def _cpu() -> Entry:
     total = os.cpu_count() or 1
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else total
+    usable = usable_cores()
     text = f"{platform.machine()}, {usable} of {total} logical cores may be used"
     return Entry("cpu", "ok", text, {"machine": platform.machine(), "cores": usable})
 

@@ -209,7 +209,7 @@ class TrainingBatches:
         *,
         envs: range | None = None,
         device: str | None = None,
-        workers: int = 1,
+        workers: int | None = None,
     ) -> None:
         """Build the robots and their goal sets."""
         self._config, self._workers = config, workers
@@ -335,7 +335,7 @@ ShowMetrics = Callable[[UpdateMetrics, int], None]
 class ExecutionConfig:
     """How a run is executed; the weights do not depend on it."""
 
-    workers: int = 1  # number of PyBullet processes, or of MuJoCo threads
+    workers: int | None = None  # number of PyBullet processes, or of MuJoCo threads
     tensorboard: bool = True  # write TensorBoard events
     wandb: bool = False  # send metrics to Weights & Biases
     minutes: int | None = None
@@ -345,7 +345,7 @@ class ExecutionConfig:
         """Check the values."""
         if self.wandb:
             require_wandb()
-        if self.workers < 1:
+        if self.workers is not None and self.workers < 1:
             raise TaskError(f"--workers {self.workers}: expected 1 or more")
 
 

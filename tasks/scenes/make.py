@@ -98,7 +98,7 @@ class BatchOptions(TypedDict, total=False):
     sim: str | None
     seed: int
     kind: ActionKind
-    workers: int
+    workers: int | None
     contacts: Contacts | None
     observe: ObservationConfig | None
     max_links: int | None
@@ -217,7 +217,7 @@ def batch_from_specs(
     sim: str | None = None,
     seed: int = 0,
     kind: ActionKind = "continuous",
-    workers: int = 1,
+    workers: int | None = None,
     contacts: Contacts | None = None,
     observe: ObservationConfig | None = None,
     max_links: int | None = None,
@@ -233,6 +233,9 @@ def batch_from_specs(
     """
     if observe is not None and not isinstance(observe, ObservationConfig):
         raise TaskError(f"observe {observe!r}: expected an ObservationConfig")
+    simulator = SIMULATORS[sim or DEFAULT_SIMULATOR]
+    if workers is None:
+        workers = simulator.default_workers(num_envs)
     workers, seed = (
         whole_number(name, value, TaskError)
         for name, value in (("workers", workers), ("seed", seed))
@@ -246,7 +249,6 @@ def batch_from_specs(
     if kind not in (kinds := get_args(ActionKind)):
         raise TaskError(f"unknown action kind {kind!r}{nearest(kind, kinds)}")
     require_geometry(geometry)
-    simulator = SIMULATORS[sim or DEFAULT_SIMULATOR]
     require_simulator_device(simulator.name, device)
     if workers > 1 and not simulator.takes_workers:
         raise TaskError(

@@ -16,6 +16,7 @@ from morphgen.model.dynamics import GRAVITY as GRAVITY  # robots carry their own
 from morphgen.model.geometry import IDENTITY, Pose
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
+from morphgen.processes import usable_cores
 from morphgen.typing import Array
 
 if TYPE_CHECKING:  # processes of PyBullet need no torch, which takes seconds to load and 200 MB
@@ -24,6 +25,8 @@ if TYPE_CHECKING:  # processes of PyBullet need no torch, which takes seconds to
 TIMESTEP = 0.005  # physics step: 200 Hz, as in AnyBody [s]
 SUBSTEPS = 4  # number of physics steps per control step
 CONTROL_PERIOD = TIMESTEP * SUBSTEPS  # duration of a control step: actions come at 50 Hz [s]
+
+MOST_WORKERS = 8  # more threads would wait for Python's lock
 
 HOST_DEVICES = ("cpu",)
 """Types of devices whose tensors the processor reads without waiting.
@@ -330,3 +333,11 @@ class Simulator:
     """Distance within which convex meshes push each other away, although they do not touch [m]."""
     takes_workers: bool = True
     """Whether processes or threads share its work; one without steps all environments at once."""
+    worker_envs: int = 0
+    """Environments for which another worker is worth its cost: by default there are as many workers
+    as these allow and cores can be used; 0 for one."""
+
+    def default_workers(self, num_envs: int) -> int:
+        """Return the number of workers if none is asked for; no result depends on it."""
+        most = num_envs // self.worker_envs if self.worker_envs else 1
+        return max(min(most, usable_cores(), MOST_WORKERS), 1)

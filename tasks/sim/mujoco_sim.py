@@ -351,4 +351,5 @@ SIMULATOR = Simulator(
     lambda scenes, contacts, workers, _: MujocoSimulation(scenes, contacts, threads=workers),
     native_step=("mujoco", "mj_step"),
     max_envs=1024,
+    worker_envs=8,
 )

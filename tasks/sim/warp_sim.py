@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -18,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.errors import MissingDependencyError, SimulationError
+from morphgen.processes import usable_cores
 
 try:
     import mujoco_warp
@@ -498,11 +498,10 @@ def load_kernels(groups: Sequence[Group], device: str) -> None:
     H100 with 16 cores the first start took 183 s so, and takes 27 s.
     """
     modules = kernels_of(groups, device)
-    workers = len(os.sched_getaffinity(0))
     if not kernels_stored(wp.get_device(device).arch):
         _log.warning("compiling %s parts of MuJoCo Warp for this GPU, once", len(modules))
     last = time.monotonic()
-    with ThreadPoolExecutor(workers) as pool:
+    with ThreadPoolExecutor(usable_cores()) as pool:
         loads = [pool.submit(module.load, wp.get_device(device), size) for module, size in modules]
         for done, load in enumerate(as_completed(loads), 1):
             load.result()
