@@ -164,7 +164,13 @@ def _threads(args: argparse.Namespace, agent: str, sim: str, count: int, loaded:
 
 
 def _speed(
-    robot: str, agent: str, sim: str, envs: int, rounds: int, torch_threads: int, workers: int
+    robot: str,
+    agent: str,
+    sim: Any,  # noqa: ANN401
+    envs: int,
+    rounds: int,
+    torch_threads: int,
+    workers: int,
 ) -> float:
     """Return transitions per second of a learner; 0 stands for the threads of ``train``."""
     from morphgen.tasks.scenes.env_specs import load_robot
@@ -172,9 +178,14 @@ def _speed(
 
     torch.set_num_threads(torch_threads or 1)
     policy = PolicyConfig(agent, discrete=False)
-    options = {"kind": policy.kind, "observe": observation_config(policy.channels)}
     batch = make_batch(
-        "reach", [load_robot(robot)], envs, sim=sim, workers=workers or None, **options
+        "reach",
+        [load_robot(robot)],
+        envs,
+        sim=sim,
+        kind=policy.kind,
+        observe=observation_config(policy.channels),
+        workers=workers or None,
     )
     with closing(batch):
         learner = Learner(batch, policy, PPOConfig(total_timesteps=10**9))

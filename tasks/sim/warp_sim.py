@@ -43,6 +43,22 @@ UNUSED = frozenset({"dof_length", "key_time", "key_qpos", "key_qvel", "key_act",
 """Fields of a model that no step reads: sleeping is off, and keyframes are not used."""
 
 
+PAIRS = frozenset(
+    {
+        *("body_conaffinity", "geom_conaffinity", "geom_pair_type_count"),
+        *("nxn_geom_pair_filtered", "nxn_pairid", "nxn_pairid_filtered"),
+        *("nexclude", "exclude_signature"),
+    }
+)
+"""Fields of a model that say which pairs of geoms are tested; ``_put_pairs`` sets them."""
+MATERIAL = tuple(
+    f"geom_{name}" for name in ("condim", "solmix", "solref", "solimp", "friction", "margin", "gap")
+)
+"""Fields of geoms that their contacts depend on, besides their priority."""
+NEVER = -1e3
+"""Margin of a pair that a world does not test [m]: the broad phase takes it to be far apart."""
+
+
 @dataclass(frozen=True, eq=False)
 class Structure:
     """Environments whose models differ only in numbers that MuJoCo Warp has for every world."""
@@ -50,14 +66,16 @@ class Structure:
     worlds: tuple[World, ...]  # compiled scenes, R of them: the one of world w is `worlds[w % R]`
     envs: NDArray[np.int64]  # environment of each world, shape (w,)
     batched: dict[str, NDArray[Any]]  # rows of the fields of the model that differ, R rows each
+    pairs: NDArray[np.int64]  # pairs of geoms that any world tests, shape (P, 2)
+    tested: NDArray[np.bool_]  # which of them the world of a row tests, shape (R, P)
 
 
 def structures(scenes: Sequence[Scene], compiled: Sequence[World]) -> list[Structure]:
     """Group environments by the structure of their models.
 
     Two models have one structure if all fields that MuJoCo Warp holds once for all worlds are
-    equal: the tree, the types of joints, geoms and actuators, the pairs of geoms that are tested,
-    and meshes. Masses, poses, sizes, limits and gains may differ.
+    equal: the tree, the types of joints, geoms and actuators, and meshes. Masses, poses, sizes,
+    limits, gains and the pairs of geoms that are tested may differ.
     """
     models: dict[int, Model] = {}
     envs_of: dict[int, list[int]] = {}  # environments of each compiled scene
@@ -66,10 +84,13 @@ def structures(scenes: Sequence[Scene], compiled: Sequence[World]) -> list[Struc
         if id(world) not in models:
             models[id(world)] = model = _warp_model(world, scenes[env])
             for members, batched in groups:
-                names = _differences(models[id(members[0])], model)
+                names = {*_differences(models[id(members[0])], model)}
+                if not PAIRS.isdisjoint(names) and not _have_one_material(members[0], world):
+                    continue
+                names -= PAIRS
                 if all(map(_is_batched, names)) and _same_indices(members[0], world):
                     members.append(world)
-                    batched.update(dict.fromkeys(names))
+                    batched.update(dict.fromkeys(sorted(names)))
                     break
             else:
                 groups.append(([world], {}))
@@ -82,8 +103,29 @@ def structures(scenes: Sequence[Scene], compiled: Sequence[World]) -> list[Struc
             name: np.concatenate([getattr(models[id(world)], name).numpy() for world in rows])
             for name in batched
         }
-        found.append(Structure(rows, np.array(envs, dtype=np.int64), numbers))
+        tested = [_tested_pairs(models[id(world)], rows[0].model.ngeom) for world in rows]
+        pairs = np.argwhere(np.any(tested, axis=0))
+        of_rows = np.array([matrix[*pairs.T] for matrix in tested])
+        found.append(Structure(rows, np.array(envs, dtype=np.int64), numbers, pairs, of_rows))
     return found
+
+
+def _tested_pairs(model: Model, ngeom: int) -> NDArray[np.bool_]:
+    """Return which pairs of geoms a model tests, shape (ngeom, ngeom), upper triangle."""
+    tested = np.zeros((ngeom, ngeom), dtype=bool)
+    tested[*model.nxn_geom_pair_filtered.numpy().T] = True
+    return tested
+
+
+def _have_one_material(*scenes: World) -> bool:
+    """Return whether all contacts between geoms without priority are alike: of links and ground."""
+    rows = [
+        np.column_stack([getattr(scene.model, name) for name in MATERIAL])[
+            scene.model.geom_priority == 0
+        ]
+        for scene in scenes
+    ]
+    return bool((np.concatenate(rows) == rows[0][0]).all())
 
 
 def put_model(structure: Structure, device: str) -> Model:
@@ -95,10 +137,48 @@ def put_model(structure: Structure, device: str) -> Model:
         )
         for name, values in structure.batched.items():
             getattr(model, name).assign(values)
+        if not structure.tested.all():
+            _put_pairs(model, structure)
     model.opt.warn_overflow = 0  # it prints; ``WarpSimulation`` counts
     # A loop that the GPU ends by itself can be no branch of a graph, so ``_StepGraph`` unrolls it.
     model.opt.graph_conditional, model.opt.iterations = False, ITERATIONS
     return model
+
+
+def _put_pairs(model: Model, structure: Structure) -> None:
+    """Have every world test its own pairs.
+
+    Those that some worlds test become contact pairs of MuJoCo, which have a margin for every world,
+    with the material that all of them have; see ``_have_one_material``.
+    """
+    pairs, some = structure.pairs, ~structure.tested.all(axis=0)
+    count, first = int(some.sum()), structure.worlds[0].model
+    numbers = np.full_like(pairs, -1)
+    numbers[some, 0] = np.arange(count)
+    model.nxn_geom_pair_filtered = _array(pairs, model.nxn_geom_pair_filtered.dtype)
+    model.nxn_pairid_filtered = _array(numbers, model.nxn_pairid_filtered.dtype)
+    low, high = np.sort(first.geom_type[pairs], axis=1).T
+    kinds = len(mujoco_warp.GeomType)
+    kind = low * (2 * kinds - low - 1) // 2 + high
+    size = len(model.geom_pair_type_count)
+    model.geom_pair_type_count = tuple(np.bincount(kind, minlength=size).tolist())
+    geom = int(np.flatnonzero(first.geom_priority == 0)[0])
+    slide, spin, roll = first.geom_friction[geom]
+    margins = np.where(structure.tested[:, some], first.geom_margin[geom], NEVER)
+    values = {
+        "margin": margins,
+        "gap": [[first.geom_gap[geom]] * count],
+        "adhesion": [[0.0] * count],
+        "friction": [[(slide, slide, spin, roll, roll)] * count],
+        "solref": [[first.geom_solref[geom]] * count],
+        "solreffriction": [[(0.0, 0.0)] * count],  # that of the normal
+        "solimp": [[first.geom_solimp[geom]] * count],
+        "dim": [first.geom_condim[geom]] * count,
+    }
+    model.npair = count
+    for name, rows in values.items():
+        field = f"pair_{name}"
+        setattr(model, field, _array(rows, getattr(model, field).dtype))
 
 
 def _prepared(model: mujoco.MjModel) -> mujoco.MjModel:

@@ -112,13 +112,31 @@ def test_robots_of_one_structure_share_a_model_and_move_as_if_they_were_alone(
 
 
 def test_structures_differ_where_the_library_has_one_value_for_all_worlds():
-    """Other joints, types of shapes and ignored pairs make another structure."""
+    """Other joints and types of shapes make another structure."""
     base = robot("arm=arm3 ee=stick")
-    first, *_, last = (link.name for link in base.links if link.collisions)
-    other_pairs = replace(base, ignore_pairs=(*base.ignore_pairs, sorted_pair(first, last)))
-    scenes = [Scene(base), Scene(other_pairs), Scene(robot("arm=arm3 ee=plane")), Scene(base)]
+    names = ("arm=arm5 ee=stick", "arm=arm3 ee=plane")
+    scenes = [Scene(base), *(Scene(robot(words)) for words in names), Scene(base)]
     groups = structures(scenes, worlds(scenes, Contacts()))
     assert [each.envs.tolist() for each in groups] == [[0, 3], [1], [2]]
+
+
+def test_robots_of_one_structure_test_their_own_pairs():
+    base = robot("arm=arm3 ee=stick")
+    first, *_, arm_tip, stick = (link.name for link in base.links if link.collisions)
+    pairs = (sorted_pair(first, arm_tip), sorted_pair(first, stick))
+    other = replace(base, ignore_pairs=(*base.ignore_pairs, *pairs))
+    scenes = [Scene(base, ground=None), Scene(other, ground=None)]
+    both, *alone = simulation(scenes), *(simulation([scene]) for scene in scenes)
+    assert len(both.counts) == 1
+    onto_itself = torch.tensor([[2.38, -1.83, 2.46, 2.03, 1.68]])
+    for _ in range(2 * SECOND):
+        both.step(onto_itself.expand(2, -1))
+        for each in alone:
+            each.step(onto_itself)
+    assert torch.allclose(both.q, torch.cat([each.q for each in alone]), atol=1e-4)
+    stopped, passed = both.q[:, 3].tolist()
+    assert stopped < 1.7
+    assert passed > 1.95
 
 
 def test_a_reset_changes_only_its_environments_and_forgets_their_past(arms, sim):
