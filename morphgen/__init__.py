@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from morphgen.api.checks import check, conform, fix
     from morphgen.api.environments import make_env
     from morphgen.api.evaluation import evaluate, play
+    from morphgen.api.export import export
     from morphgen.api.goals import goals
     from morphgen.api.robots import compose, fit, read, sample, write
     from morphgen.api.splits import split
@@ -34,6 +35,7 @@ __all__ = [
     "compose",
     "conform",
     "evaluate",
+    "export",
     "fit",
     "fix",
     "goals",
@@ -55,6 +57,7 @@ _MODULES = {
     "compose": "morphgen.api.robots",
     "conform": "morphgen.api.checks",
     "evaluate": "morphgen.api.evaluation",
+    "export": "morphgen.api.export",
     "fit": "morphgen.api.robots",
     "fix": "morphgen.api.checks",
     "goals": "morphgen.api.goals",

@@ -21,6 +21,7 @@ FUNCTIONS = (
     "compose",
     "conform",
     "evaluate",
+    "export",
     "fit",
     "goals",
     "make_env",
@@ -279,6 +280,11 @@ make_env("reach", [], num_envs=2) => expected at least one robot
 make_env("reach", num_envs=2, config=3) => unknown option 'config'
 make_env("reach", num_envs=2, autoreset_mode="Disabled") => autoreset_mode Disabled: expected SAME_S
 prims_env(num_envs=0) => 0 environments
+export("prims", "gltf") => unknown format 'gltf'; did you mean 'glb'
+export("prims", "gif", dark=True) => dark: only with format html
+export("prims", "glb", seed=0) => seed: only with format srdf or curobo or ros2
+export("prims", "urdf", cover=0.9) => cover: only with spheres
+export("prims", "urdf", spheres=40) => 40 spheres: expected 1 to 32
 train("prims") => prims: no such file, and no split of this name
 train("prims task=rich") => unknown task 'rich'
 train("prims task=reach", seed=-1) => seed -1: expected a whole number, 0 or more
@@ -334,6 +340,7 @@ NOT_TEXTS = (5, None, [3], {}, 1.5, b"x", object())
         lambda value: morphgen.evaluate(value),
         lambda value: morphgen.play(value, "prims"),
         lambda value: morphgen.goals(value),
+        lambda value: morphgen.export("prims", value),
     ],
 )
 def test_values_that_are_no_texts_give_one_clear_error(call):

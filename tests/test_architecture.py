@@ -39,8 +39,8 @@ PACKAGES = (
     "tasks",
     "rl",
     "benchmark",
-    "api",
     "viewer",
+    "api",
     "doctor",
     "cli",
 )

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from helpers.robots import arm
+from morphgen.api import export
 from morphgen.checks.robot_srdf import MATRIX_SAMPLES, robot_srdf_text
-from morphgen.cli import export
 from morphgen.cli.command import read_commands
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.formats.bundle import EXPORTS, file_findings, write_bundle

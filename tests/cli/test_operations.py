@@ -15,6 +15,7 @@ ROBOTS = {"words": "robots"}
 OPERATIONS = {
     "conform": ("conform", ROBOT, {"root", "json", "wide"}),
     "eval": ("evaluate", ROBOTS | {"checkpoint": "policy"}, {"out", "json", "wide"}),
+    "export": ("export", ROBOT, {"root", "json"}),
     "goals": ("goals", ROBOTS, {"json", "wide"}),
     "play": ("play", ROBOT, set()),
     "train": ("train", ROBOTS, {*SWITCHES, "observe"}),

@@ -20,8 +20,8 @@ from helpers.robots import arm
 from helpers.runs import RUN, SMALL, small_split
 from helpers.splits import TRAIN, combined, member
 from morphgen import cli
+from morphgen.api.export import FILES
 from morphgen.cli.command import whole_number
-from morphgen.cli.export import FILES
 from morphgen.errors import MorphgenError
 from morphgen.formats import bundle
 from morphgen.splits.split_file import split_text
@@ -79,8 +79,7 @@ import 机器人.urdf a.xml => name '___': use letters
 export prims --format gif --dark => --dark: only with --format html
 export prims --format glb --samples 9 => --samples: only with --format srdf, curobo or ros2
 export prims --format glb --spheres 4 => srdf, urdf, mjcf, sdf, curobo, usd or ros2
-export prims --out nowhere => --out nowhere: no such folder
-export prims --out /dev/null => --out /dev/null: is no folder
+export prims --out /dev/null => cannot write to /dev/null: /dev/null is a file
 export prims --format pdf => curobo, gif, glb, html, mjcf, mp4, ros2, sdf, srdf, urdf
 export prims --format curobo --cover 0.9 => --cover: only with --spheres
 export prims --format curobo --spheres 40 => 40 spheres: expected 1 to 32

@@ -1,0 +1,261 @@
+"""Robots as files and folders of other tools, web pages and videos.
+
+A format is one function, a row of ``FILES`` or ``FOLDERS``, and a few words in ``commands.txt``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
+from os import PathLike
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import SimpleNamespace
+
+from morphgen.api.checks import bundle_of
+from morphgen.arguments import checked_signature, path_argument, require_types, text_argument
+from morphgen.checks.robot_srdf import (
+    MATRIX_SAMPLES,
+    collision_matrix,
+    matrix_evidence,
+    robot_srdf_text,
+)
+from morphgen.errors import FormatError, nearest
+from morphgen.extras import explain_missing_extras
+from morphgen.fitting.replace_collision import SPHERES, as_spheres, link_spheres
+from morphgen.formats.bundle import (
+    MESHES,
+    MJCF,
+    URDF,
+    bundle_folder,
+    split_colours,
+    write_fits,
+    write_meshes,
+)
+from morphgen.formats.files import write_atomic, writing_export
+from morphgen.formats.glb import glb_bytes
+from morphgen.formats.mjcf.write import mjcf_text
+from morphgen.formats.ros_package import ros_package_name, write_ros_package
+from morphgen.formats.sdf import MODEL_CONFIG, MODEL_SDF, model_config_text, sdf_text
+from morphgen.formats.srdf import CUROBO_CONFIG, curobo_text, require_tool
+from morphgen.formats.urdf.write import MeshUri, urdf_text
+from morphgen.formats.usd import convert_urdf
+from morphgen.grammar.library import LibraryFolders, default_library
+from morphgen.grammar.robot_source import RobotLike, RobotReference, find_robot, read_source
+from morphgen.model.robot import Robot
+
+_WITH_PAIRS = ("srdf", "curobo", "ros2")
+_WITH_SPHERES = ("srdf", "urdf", "mjcf", "sdf", "curobo", "usd", "ros2")
+_FORMATS = {
+    "dark": ("html",),
+    "samples": _WITH_PAIRS,
+    "seed": _WITH_PAIRS,
+    "spheres": _WITH_SPHERES,
+}
+"""Formats of arguments that have no effect on others."""
+
+
+@checked_signature
+@explain_missing_extras()
+def export(
+    robot: RobotLike,
+    format: str = "html",
+    out: str | PathLike[str] | None = None,
+    *,
+    dark: bool = False,
+    samples: int | None = None,
+    seed: int | None = None,
+    spheres: int | None = None,
+    cover: float | None = None,
+    library: LibraryFolders = (),
+) -> Path:
+    """Write a robot for other tools, as a web page, or as a video in which it turns.
+
+    Examples:
+        >>> print(morphgen.export("ur5-plane", "glb"))
+        ur5-plane.glb
+
+    Args:
+        robot: The robot, its bundle's folder, a description, or words of ``compose``.
+        format: A file: ``html``, ``mp4``, ``gif``, ``glb`` or ``srdf``; or a folder: ``urdf``,
+            ``mjcf``, ``sdf``, ``curobo``, ``usd`` or ``ros2``.
+        out: Output folder; by default the robot's bundle for a file, its parent for a folder, and
+            the current folder for other robots.
+        dark: Whether an ``html`` page is dark.
+        samples: Number of configurations in which pairs of links are tested, by default 10,000.
+        seed: Seed of these configurations, by default 0.
+        spheres: Replace the collision shapes of each link by so many spheres; in an SRDF, add them.
+        cover: Share of each link's volume that the spheres must cover, such as 0.995.
+        library: Folders of your own parts.
+
+    Returns:
+        The file or folder. An existing folder is replaced only if all its files are of an export.
+
+    Raises:
+        FormatError: If the format is unknown, or an argument has no effect on it.
+        MissingDependencyError: If the extra that the format needs is not installed.
+        MorphgenError: If the robot cannot be read or written.
+    """
+    given = SimpleNamespace(**locals())
+    given.out = None if out is None else path_argument("out", out, FormatError)
+    require_types(given, FormatError, samples=1, seed=0, spheres=1)
+    if text_argument("format", format, FormatError) not in (valid := (*FILES, *FOLDERS)):
+        raise FormatError(f"unknown format {format!r}{nearest(format, valid)}")
+    pairs = ("srdf", "curobo", "ros2")
+    only = {"dark": ("html",), "samples": pairs, "seed": pairs, "spheres": ("srdf", *FOLDERS)}
+    for name, formats in only.items():
+        is_given = getattr(given, name) is not None and getattr(given, name) is not False
+        if is_given and format not in formats:
+            raise FormatError(f"{name}: only with format {' or '.join(formats)}")
+    if cover is not None and spheres is None:
+        raise FormatError("cover: only with spheres")
+    parts, source = default_library(library), None
+    if not isinstance(robot, Robot):
+        source = find_robot(robot)
+        robot = read_source(source, parts)
+    return write_export(source, robot, given)
+
+
+def write_export(
+    source: RobotReference | None,
+    robot: Robot,
+    given: SimpleNamespace,
+    taken: Collection[Path] = (),
+) -> Path:
+    """Write the file or folder of a robot, and return its path, which others may have taken."""
+    path = _target(source, robot, given)
+    if source is not None and path in taken:
+        raise FormatError(f"{source.label}: {path} is of another robot of this command already")
+    made = [folder for folder in path.parents if not folder.exists()]
+    try:
+        if given.format in FILES:
+            content = FILES[given.format](robot, given)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomic(path, content)
+        else:
+            with writing_export(path, given.format, robot.name) as folder:
+                FOLDERS[given.format](robot, folder, given)
+    except BaseException:
+        for folder in made:  # the inner ones come first
+            with suppress(OSError):
+                folder.rmdir()
+        raise
+    return path
+
+
+def _target(source: RobotReference | None, robot: Robot, given: SimpleNamespace) -> Path:
+    """Return the path of a robot's file or folder."""
+    bundle = bundle_of(source) if given.out is None and source is not None else None
+    if bundle is not None and given.format in FILES:
+        return bundle / f"robot.{given.format}"
+    beside = Path() if bundle is None else Path(os.path.normpath(bundle / ".."))
+    path = bundle_folder(given.out or beside, robot.name)
+    if given.format == "ros2":
+        return path.with_name(ros_package_name(robot.name))
+    if given.format in FOLDERS:
+        return path.with_name(f"{robot.name}-{given.format}")
+    return path.with_name(f"{path.name}.{given.format}")
+
+
+def _html(robot: Robot, given: SimpleNamespace) -> bytes:
+    from morphgen.viewer.app.web_page import robot_page  # of an extra, and seconds to import
+
+    return robot_page(robot, dark=given.dark)
+
+
+def _video(robot: Robot, given: SimpleNamespace) -> bytes:
+    from morphgen.viewer.film import turntable  # of an extra, and seconds to import
+
+    return turntable(robot, f".{given.format}")
+
+
+def _glb(robot: Robot, given: SimpleNamespace) -> bytes:
+    return glb_bytes(split_colours(robot))
+
+
+def _srdf(robot: Robot, given: SimpleNamespace) -> bytes:
+    require_tool(robot)  # before spheres are fitted
+    # The pairs are those of the robot's own shapes, which planners may test, too.
+    return _srdf_text(robot, _with_spheres(robot, given), given).encode()
+
+
+def _srdf_text(robot: Robot, sphered: Robot, given: SimpleNamespace) -> str:
+    spheres = link_spheres(sphered)
+    return robot_srdf_text(
+        robot, samples=given.samples or MATRIX_SAMPLES, seed=given.seed or 0, spheres=spheres
+    )
+
+
+def _with_spheres(robot: Robot, given: SimpleNamespace, default: int | None = None) -> Robot:
+    """Return the robot with the spheres that are asked for as its collision shapes, if any."""
+    number = given.spheres or default
+    if number is None:
+        return robot
+    folders = default_library(given.library).folders  # with the parts' stored fits
+    return as_spheres(robot, folders, spheres=number, cover=given.cover)
+
+
+def _with_meshes(robot: Robot, folder: Path, texts: str) -> None:
+    """Write meshes and the texts of a format, which name them by relative paths."""
+    robot = split_colours(robot)
+    files = write_meshes(robot, folder / MESHES)
+    for name, text in TEXTS[texts](robot, files.__getitem__).items():
+        (folder / name).write_text(text, encoding="utf-8")
+    if (folder / URDF).is_file():
+        write_fits(robot, folder)
+
+
+def _meshed(robot: Robot, folder: Path, given: SimpleNamespace) -> None:
+    _with_meshes(_with_spheres(robot, given), folder, given.format)
+
+
+def _curobo(robot: Robot, folder: Path, given: SimpleNamespace) -> None:
+    require_tool(robot)
+    robot = _with_spheres(robot, given, SPHERES)
+    matrix = collision_matrix(robot, samples=given.samples or MATRIX_SAMPLES, seed=given.seed or 0)
+    evidence = matrix_evidence(robot, matrix)
+    text = curobo_text(robot, link_spheres(robot), matrix.reasons, URDF, evidence)
+    _with_meshes(robot, folder, "urdf")
+    (folder / CUROBO_CONFIG).write_text(text, encoding="utf-8")
+
+
+def _usd(robot: Robot, folder: Path, given: SimpleNamespace) -> None:
+    with TemporaryDirectory() as scratch:
+        _with_meshes(_with_spheres(robot, given), Path(scratch), "urdf")
+        convert_urdf(Path(scratch) / URDF, folder)
+
+
+def _ros2(robot: Robot, folder: Path, given: SimpleNamespace) -> None:
+    require_tool(robot)
+    robot = _with_spheres(robot, given)
+    write_ros_package(robot, folder, _srdf_text(robot, robot, given))
+
+
+TEXTS: Mapping[str, Callable[[Robot, MeshUri], Mapping[str, str]]] = {
+    "urdf": lambda robot, uri: {URDF: urdf_text(robot, uri)},
+    "mjcf": lambda robot, uri: {MJCF: mjcf_text(robot, uri)},
+    "sdf": lambda robot, uri: {
+        MODEL_SDF: sdf_text(robot, uri),
+        MODEL_CONFIG: model_config_text(robot),
+    },
+}
+"""Functions that return a robot's texts by their names, by the format's name."""
+FILES: Mapping[str, Callable[[Robot, SimpleNamespace], bytes]] = {
+    "html": _html,
+    "mp4": _video,
+    "gif": _video,
+    "glb": _glb,
+    "srdf": _srdf,
+}
+"""Functions that return the content of a robot's file, by the format's name, which is its suffix.
+"""
+FOLDERS: Mapping[str, Callable[[Robot, Path, SimpleNamespace], None]] = {
+    "urdf": _meshed,
+    "mjcf": _meshed,
+    "sdf": _meshed,
+    "curobo": _curobo,
+    "usd": _usd,
+    "ros2": _ros2,
+}
+"""Functions that write a robot's files into an empty folder, by the format's name."""
