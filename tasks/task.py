@@ -99,13 +99,14 @@ class TaskConfig:
     """Time limit of an episode [control steps]."""
     num_goals: int
     """Number of goals in a robot's goal set."""
-    obstacles: int
-    """Number of boxes in the scene if obstacles are requested."""
-    obstacle_size: tuple[float, float]
+    obstacles: int = 0
+    """Number of boxes in the scene if obstacles are requested; a task without any may leave out
+    this field and those that follow."""
+    obstacle_size: tuple[float, float] = (0.06, 0.15)
     """Range of the edge lengths of these boxes, relative to the robot's reach."""
-    train_layouts: int
+    train_layouts: int = 1
     """Number of layouts of these boxes that training draws its episodes from."""
-    eval_layouts: int
+    eval_layouts: int = 1
     """Number of further layouts that evaluation draws its episodes from."""
 
     def __post_init__(self) -> None:
