@@ -473,18 +473,26 @@ class CheckedRelease:
     survey: SplitSurvey
 
 
+def require_releasable(
+    split: Split, library: Library, request: ReleaseRequest
+) -> tuple[LicencedPart, ...]:
+    """Require valid names and allowed licences of a release; return the parts of its robots."""
+    parts = licenced_parts(split, library)
+    require_allowed(split, parts, request.allowed_licences)
+    _release(split, request, {})
+    return tuple(parts)
+
+
 def check_release(
     split: Split, library: Library, request: ReleaseRequest, *, jobs: int = 1
 ) -> CheckedRelease:
     """Require that a split may be released: names, licences of its parts, and audit."""
-    parts = licenced_parts(split, library)
-    require_allowed(split, parts, request.allowed_licences)
-    release = _release(split, request, {})
+    parts = require_releasable(split, library, request)
     survey = survey_split(split, library, pairs="train", jobs=jobs)
     audited = audit_survey(survey, library)
     require_passed(audited)
     release = _release(split, request, _difficulty_data(survey, audited))
-    return CheckedRelease(release, tuple(parts), survey)
+    return CheckedRelease(release, parts, survey)
 
 
 def archive_path(out: Path, split: Split, release_version: str) -> Path:

@@ -25,6 +25,7 @@ from morphgen.benchmark.release import (
     opened_folder,
     read_release,
     release_split,
+    require_releasable,
 )
 from morphgen.benchmark.scores.results import (
     NOTE,
@@ -79,6 +80,7 @@ def release(args: argparse.Namespace) -> None:
         goals=not args.no_goals,
         settings=BuildSettings(light=args.light),
     )
+    require_releasable(split, library, request)
     notes = _notes(args, split, extra)
     if not args.json:
         print("".join(f"note: {note}\n" for note in notes), end="", flush=True)
