@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 
 from morphgen.arguments import whole_number
 from morphgen.errors import MissingDependencyError, MorphgenError
-from morphgen.progress import raise_if_interrupted, report, show_progress
+from morphgen.progress import STOP_SIGNALS, raise_if_interrupted, report, show_progress
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -32,8 +32,6 @@ CHUNK_SIZE = 8
 POLL_INTERVAL = 0.2
 """Interval at which workers check whether the parent has stopped, and the parent whether a signal
 was received [s]."""
-STOP_SIGNALS = (signal.SIGTERM, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()))
-"""Signals that stop a command as Ctrl-C does: of a service manager, of a closed terminal."""
 CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
 """File in which Linux tells a container how much of the cores it may use."""
 RAY_TIMEOUT = 5.0

@@ -6,6 +6,7 @@ The listener is in a context variable. A new thread or process has none: its rep
 from __future__ import annotations
 
 import logging
+import signal
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
@@ -33,6 +34,8 @@ class StagedProgress(Progress, Protocol):
 
 _listener: ContextVar[Progress | None] = ContextVar("listener", default=None)
 
+STOP_SIGNALS = (signal.SIGTERM, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()))
+"""Signals that stop a command as Ctrl-C does: of a service manager, of a closed terminal."""
 interrupts: list[int] = []
 """Signals that stopped the command which is running. Python loses the ``KeyboardInterrupt`` that
 Ctrl-C raises while it calls a ``__del__`` or the callback of a weak reference, as each import does,

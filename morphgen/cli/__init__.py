@@ -18,15 +18,18 @@ if TYPE_CHECKING:  # imported when a command runs, so that Ctrl-C meanwhile is c
     from morphgen.cli.command import Parser
 
 
-def build_parser() -> Parser:
-    """Return the parser of every command; each sets ``run``, which may return an exit code."""
+def build_parser(words: Sequence[str] = ()) -> Parser:
+    """Return the parser of every command; each sets ``run``, which may return an exit code.
+
+    words: A command line; its command is the only one if it has one.
+    """
     from morphgen.cli.command import Parser, add_commands, read_commands
 
     parser = Parser(
         prog="morphgen", description="Create robot morphologies, train policies on them, view them."
     )
     parser.add_argument("--version", action="store_true", help="print the version and exit")
-    add_commands(parser, read_commands())
+    add_commands(parser, read_commands(words))
     return parser
 
 
@@ -67,7 +70,7 @@ def _run(argv: Sequence[str] | None, received: list[int]) -> int:
     from morphgen.errors import MorphgenError, one_line
     from morphgen.extras import missing_extra
 
-    parser = build_parser()
+    parser = build_parser(sys.argv[1:] if argv is None else argv)
     try:
         args = parse(parser, argv)
     except UsageError as error:
@@ -103,8 +106,7 @@ def _stopping_cleanly(received: list[int]) -> Iterator[None]:
     The signals are appended to the list. Those that have another handler, or are ignored as by
     ``nohup``, stay as they are.
     """
-    from morphgen.processes import STOP_SIGNALS
-    from morphgen.progress import interrupts
+    from morphgen.progress import STOP_SIGNALS, interrupts
 
     interrupts.clear()
     defaults = (signal.default_int_handler, signal.SIG_DFL)

@@ -11,10 +11,11 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from string import Template
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeAlias
 
 from morphgen.errors import MorphgenError, nearest
 from morphgen.rl.agents import AGENTS, PRESETS
@@ -34,6 +35,8 @@ _VALUE = re.compile(
     r"(?P<metavar>[^({]*?)(?:\((?P<type>[^)]+)\))?(?:\{(?P<choices>[^}]+)\})?(?P<many> \.\.\.|\*)?"
 )
 _RULE = re.compile(r"(--[^:]+): only (with|without) (--[\w-]+)(?:=(\S+))?")
+Names: TypeAlias = Callable[[], Mapping[str, Any]]
+"""Function that returns what stands for the names in ``commands.txt``; see ``_names``."""
 _PATHS = re.compile(r"DIR|FOLDER|PATH|FILE\b.*")
 """Words for a value that is a path."""
 
@@ -95,9 +98,12 @@ class Command:
         return code
 
 
-def read_commands() -> list[Command]:
-    """Return the commands of ``commands.txt``."""
-    text, names = COMMANDS.read_text(encoding="utf-8"), _names()
+def read_commands(words: Sequence[str] = ()) -> list[Command]:
+    """Return the commands of ``commands.txt``, or only the one that begins a command line."""
+    text = COMMANDS.read_text(encoding="utf-8")
+    first = next((word for word in words if not word.startswith("-")), "")
+    is_command = first and re.search(rf"(?m)^{re.escape(first)}( [\w-]+)* = ", text)
+    names = cache(_names)  # looks for installed packages, which most commands do not name
     groups: dict[str, list[str]] = {}
     commands = []
     for section in re.split(r"\n(?=[@\w])", re.sub(r"(?m)^#.*\n", "", text).strip()):
@@ -107,8 +113,9 @@ def read_commands() -> list[Command]:
         lines = [each for line in lines for each in _with_groups(line, groups)]
         if head.startswith("@"):
             groups[head[1:]] = lines
-        else:
-            path, _, function = head.partition(" = ")
+            continue
+        path, _, function = head.partition(" = ")
+        if not is_command or path.partition(" ")[0] == first:
             commands.append(_command(Command(path, *function.split(", extra ")), lines, names))
     return commands
 
@@ -120,7 +127,7 @@ def _with_groups(line: str, groups: Mapping[str, list[str]]) -> list[str]:
     )
 
 
-def _command(command: Command, lines: Sequence[str], names: Mapping[str, Any]) -> Command:
+def _command(command: Command, lines: Sequence[str], names: Names) -> Command:
     """Fill a command with what the lines of its section say."""
     command.summary, *lines = lines
     for line in filter(None, lines):
@@ -144,12 +151,13 @@ def _command(command: Command, lines: Sequence[str], names: Mapping[str, Any]) -
     return command
 
 
-def _option(signature: str, text: str, names: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+def _option(signature: str, text: str, names: Names) -> tuple[str, dict[str, Any]]:
     """Return the flag of an option, and its settings for argparse."""
     entry = _ENTRY.fullmatch(signature)
     assert entry is not None, signature
     name = entry["name"]
-    text = Template(text).substitute(names, presets=_presets(name.removeprefix("--[no-]")))
+    if "$" in text:
+        text = Template(text).substitute(names(), presets=_presets(name.removeprefix("--[no-]")))
     settings: dict[str, Any] = {"dest": entry["dest"]} if entry["dest"] else {}
     if entry["required"]:
         settings["required"] = True
@@ -174,7 +182,7 @@ def _option(signature: str, text: str, names: Mapping[str, Any]) -> tuple[str, d
     return name, {**settings, "help": text}
 
 
-def _value(text: str, names: Mapping[str, Any], *, is_flag: bool) -> dict[str, Any]:
+def _value(text: str, names: Names, *, is_flag: bool) -> dict[str, Any]:
     """Return the settings for the value of an option, such as ``N(2..)`` or ``[ROBOT ...]``."""
     is_optional = text.startswith("[") and text.endswith("]")
     value = _VALUE.fullmatch(text[1:-1] if is_optional else text)
@@ -183,7 +191,7 @@ def _value(text: str, names: Mapping[str, Any], *, is_flag: bool) -> dict[str, A
     kind = kind or ("1.." if word == "N" else "path" if _PATHS.fullmatch(word) else "str")
     settings: dict[str, Any] = {"metavar": word or None, "type": _type(kind)}
     if choices:
-        settings["choices"] = names[choices] if choices in names else choices.split(",")
+        settings["choices"] = names()[choices] if choices.isupper() else choices.split(",")
     if many == "*":
         settings |= {"action": "append", "default": []}
     elif many:

@@ -12,7 +12,6 @@ from morphgen.cli import options as opt
 from morphgen.cli.progress import status
 from morphgen.errors import PartError
 from morphgen.grammar.catalogue import catalogue
-from morphgen.grammar.grammar_file import grammar_names, grammar_summary
 from morphgen.tables import table
 
 if TYPE_CHECKING:  # the list of parts needs no splits
@@ -32,6 +31,8 @@ def list_parts(args: argparse.Namespace) -> None:
 
 def list_grammars(args: argparse.Namespace) -> None:
     """Print the names and summaries."""
+    from morphgen.grammar.grammar_file import grammar_names, grammar_summary
+
     rows = [{"name": name, "robots": grammar_summary(name)} for name in grammar_names()]
     cells = [(row["name"], row["robots"]) for row in rows]
     opt.print_result(args, rows, lambda: table(cells, ("name", "robots")))

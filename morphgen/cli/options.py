@@ -16,11 +16,11 @@ from morphgen.cli.progress import note, track
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError, one_line
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.findings import Finding
-from morphgen.model.robot import Robot
 from morphgen.tables import fitted
 
-if TYPE_CHECKING:  # it loads packages for meshes, which take seconds
+if TYPE_CHECKING:  # they load numpy and packages for meshes, which lists do not need
     from morphgen.grammar.robot_source import RobotReference
+    from morphgen.model.robot import Robot
 
 T = TypeVar("T")
 

@@ -9,16 +9,16 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import partial
-from typing import TYPE_CHECKING, NoReturn, TypeVar
-
-from tqdm import tqdm
+from typing import IO, TYPE_CHECKING, NoReturn, TypeVar
 
 from morphgen.progress import Progress, raise_if_interrupted, show_progress
 from morphgen.tasks.registry import TASKS
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # tqdm is loaded when a bar is drawn
+    from tqdm import tqdm
+
     from morphgen.rl.distributed import UpdateMetrics
     from morphgen.rl.runs.training import ShowMetrics, Subrun
 
@@ -64,6 +64,8 @@ def _bar(
         with _lines(title, unit, total) as print_progress:
             yield print_progress
         return
+    from tqdm import tqdm
+
     shown: tqdm[NoReturn] = tqdm(
         desc=title,
         unit=f" {unit}",
@@ -144,14 +146,23 @@ def track(
 
 def note(text: str) -> None:
     """Print a line that is no part of the command's result, which alone goes to stdout."""
-    with tqdm.external_write_mode(file=sys.stderr):  # above the bars that are shown
+    with _above_bars(sys.stderr):
         print(text, file=sys.stderr, flush=True)
 
 
 def print_line(line: str) -> None:
     """Print a line above the bars that are shown."""
-    with tqdm.external_write_mode():
+    with _above_bars(sys.stdout):
         print(line, flush=True)
+
+
+def _above_bars(stream: IO[str]) -> AbstractContextManager[None]:
+    """Return a block in which lines can be printed above the bars that are shown."""
+    if "tqdm" not in sys.modules:
+        return nullcontext()
+    from tqdm import tqdm
+
+    return tqdm.external_write_mode(file=stream)
 
 
 @contextmanager
@@ -215,6 +226,8 @@ class TrainingProgress:
         metric = "score" if is_relative else "reward"
         show = _update_lines(name)
         if sys.stderr.isatty():
+            from tqdm import tqdm
+
             shown: tqdm[NoReturn] = tqdm(
                 desc=name,
                 total=config.num_updates * config.ppo.num_steps * config.num_envs,

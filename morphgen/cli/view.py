@@ -12,7 +12,7 @@ import warnings
 from contextlib import suppress
 
 from morphgen.cli.progress import note
-from morphgen.processes import STOP_SIGNALS
+from morphgen.progress import STOP_SIGNALS
 from morphgen.viewer.app.app import Viewer, serve
 
 SIGNAL_POLL = 0.5

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +15,6 @@ from msgspec.structs import fields, replace
 from morphgen.errors import FormatError, PartError, nearest
 from morphgen.formats.data_files import parse_yaml, read_bytes
 from morphgen.formats.records import FiniteNumber, PositiveNumber, Record, read_record
-from morphgen.formats.rounding import format_number
 
 SCHEMA_FILE = Path(__file__).with_name("manifest.schema.json")
 """The JSON schema of a manifest, for editors; ``docs/part_manifest.py`` writes it."""
@@ -71,6 +70,8 @@ def parse_value(text: str, parameter: Parameter, where: str) -> float:
     match = _VALUE.fullmatch(text.strip())
     if match is None:
         raise PartError(f"{where}={text}: not a number{_expected(parameter)}")
+    from morphgen.formats.rounding import format_number  # loads numpy: lists need no values
+
     value, unit = float(match["number"]), match["unit"]
     if unit:
         scales = _SCALES[parameter.unit]
@@ -82,6 +83,8 @@ def parse_value(text: str, parameter: Parameter, where: str) -> float:
 
 def require_range(value: float, parameter: Parameter, where: str) -> float:
     """Return the value if it is in the parameter's range, to 12 digits."""
+    from morphgen.formats.rounding import format_number
+
     low = min(parameter.minimum, float(format_number(parameter.minimum)))  # 2 pi rounds up
     high = max(parameter.maximum, float(format_number(parameter.maximum)))
     if not low <= value <= high:
@@ -245,6 +248,12 @@ class Manifest(Record, frozen=True, kw_only=True, dict=True):
         return {**self.parameters, MOUNT_YAW: MOUNT_YAW_PARAMETER}
 
 
+@cache
+def _keys() -> frozenset[str]:
+    """Return the keys of all manifests."""
+    return frozenset({entry.encode_name for entry in fields(Manifest)} - {"path"} | {"reference"})
+
+
 def read_manifest(path: Path) -> Manifest:
     """Read a part's YAML. A key without a value is the same as no key."""
     try:
@@ -254,8 +263,7 @@ def read_manifest(path: Path) -> Manifest:
         raise PartError(str(error)) from error
     if isinstance(data, dict):
         data = {key: value for key, value in data.items() if value is not None}
-        keys = {entry.encode_name for entry in fields(Manifest)} - {"path"} | {"reference"}
-        allowed = keys - (TEMPLATE_ONLY if "source" in data else REAL_ONLY)
+        allowed = _keys() - (TEMPLATE_ONLY if "source" in data else REAL_ONLY)
         for key in data:
             if isinstance(key, str) and key not in allowed:
                 raise PartError(f"{path}: unknown key {key!r}{nearest(key, allowed)}")
