@@ -45,10 +45,10 @@ import trimesh
 from tabulate import tabulate
 from tqdm import tqdm
 
+from morphgen.files import write_atomic
 from morphgen.fitting.link_fit import FitOptions, fit_solid
 from morphgen.fitting.quality import quality
 from morphgen.fitting.solid import Solid, solid_of, solid_of_mesh
-from morphgen.formats.files import write_atomic
 from morphgen.formats.fits import shapes_key, shapes_to_fit
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 
 from morphgen.errors import BenchmarkError
-from morphgen.formats.files import write_atomic
+from morphgen.files import write_atomic
 from morphgen.grammar.library import Library, default_library
 from morphgen.processes import parallel_map
 from morphgen.progress import show_progress

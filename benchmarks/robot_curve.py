@@ -27,7 +27,7 @@ from typing import Any
 
 from tabulate import tabulate
 
-from morphgen.formats.files import write_atomic
+from morphgen.files import write_atomic
 from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint
 
 REAL_ARMS = (

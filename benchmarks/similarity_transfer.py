@@ -45,7 +45,7 @@ from tabulate import tabulate
 from morphgen.benchmark.survey import DIFFICULTY_DIGITS, Fault, SplitSurvey, survey_split
 from morphgen.encoding.similarity import MEASURES, most_alike
 from morphgen.errors import BenchmarkError, MorphgenError
-from morphgen.formats.files import write_atomic
+from morphgen.files import write_atomic
 from morphgen.grammar.library import Library, default_library
 from morphgen.rl.runs.robot_source import read_drawn
 from morphgen.splits.candidates import RobotFactory, members, recipe_of

@@ -18,8 +18,8 @@ from platformdirs import user_cache_path
 from morphgen.benchmark.survey import robot_stats
 from morphgen.checks import check
 from morphgen.errors import MorphgenError
+from morphgen.files import write_cache_file
 from morphgen.formats.bundle import CARD, MJCF, write_bundle
-from morphgen.formats.files import write_cache_file
 from morphgen.formats.picture import render
 from morphgen.formats.zip_files import write_entries
 from morphgen.model.robot import Robot

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from morphgen.errors import FormatError
+from morphgen.files import file_stamp
 from morphgen.formats.bundle import CARD
 from morphgen.formats.data_files import read_json
 from morphgen.formats.description import SUFFIXES, is_mjcf
-from morphgen.formats.resolve import file_stamp
 from morphgen.formats.ros_package import part_licences
 from morphgen.grammar.catalogue import known_facts, stored_facts
 from morphgen.grammar.library import Library

@@ -83,15 +83,10 @@ from morphgen.benchmark.survey import (
 from morphgen.benchmark.texts import read_text
 from morphgen.encoding.similarity import MEASURES
 from morphgen.errors import BenchmarkError, MorphgenError
+from morphgen.files import file_sha256, write_atomic
 from morphgen.formats.data_files import read_json
 from morphgen.formats.data_files import read_text as read_data_text
-from morphgen.formats.files import (
-    file_sha256,
-    locked_folder,
-    replacing_folder,
-    write_atomic,
-    writing,
-)
+from morphgen.formats.files import locked_folder, replacing_folder, writing
 from morphgen.formats.records import Record, read_record
 from morphgen.formats.zip_files import ZipLimits, unpack_zip, write_zip
 from morphgen.grammar.library import Library

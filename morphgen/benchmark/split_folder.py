@@ -45,6 +45,7 @@ from morphgen.encoding.tokens import (
     require_max_links,
 )
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError
+from morphgen.files import file_sha256, write_atomic
 from morphgen.formats import records
 from morphgen.formats.bundle import (
     CARD,
@@ -58,13 +59,7 @@ from morphgen.formats.bundle import (
     write_bundle,
 )
 from morphgen.formats.data_files import parse_json, read_json, read_text
-from morphgen.formats.files import (
-    file_sha256,
-    folder_hashes,
-    leftovers,
-    locked_folder,
-    write_atomic,
-)
+from morphgen.formats.files import folder_hashes, leftovers, locked_folder
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.formats.zip_files import read_npz
 from morphgen.grammar.library import Library

@@ -23,9 +23,14 @@ from morphgen.errors import MeshError
 from morphgen.formats.data_files import parse_yaml
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Capsule, Geometry, Mesh, Shape, dimensions
-from morphgen.model.inertia import bounding_box, inertial_from_density, solid_mesh, with_inertia
+from morphgen.model.inertia import (
+    bounding_box,
+    inertial_from_density,
+    solid_triangles,
+    with_inertia,
+)
 from morphgen.model.kinematics import forward_kinematics, movable_positions
-from morphgen.model.mesh import MAX_STL_FACES, convex_hull, left_out, load_mesh
+from morphgen.model.mesh import MAX_STL_FACES, hull_triangles, left_out, mesh_triangles
 from morphgen.model.robot import (
     DEFAULT_EFFORT,
     DEFAULT_VELOCITY,
@@ -375,16 +380,16 @@ def _mesh_findings(mesh: Mesh, where: str, *, collides: bool) -> Iterator[Findin
         yield found("mesh-unresolved", where, mesh=mesh)
     elif not _is_scale_valid(mesh):
         yield found("mesh-scale-invalid", where, mesh=mesh)
-    elif fault := _mesh_fault(load_mesh, mesh):
+    elif fault := _mesh_fault(mesh_triangles, mesh):
         yield found("mesh-unreadable", where, fault=fault)
     else:
         if parts := left_out(mesh.path):
             only_drawn = all(map(_ONLY_DRAWN.match, parts))
             row = "mesh-left-out/drawn" if only_drawn else "mesh-left-out"
             yield found(row, where, mesh=mesh, parts="; ".join(parts))
-        if collides and (fault := _mesh_fault(convex_hull, mesh)):
+        if collides and (fault := _mesh_fault(hull_triangles, mesh)):
             yield found("mesh-flat", where, fault=fault)
-        faces = len(load_mesh(mesh).faces)
+        faces = len(mesh_triangles(mesh).faces)
         if faces > MAX_STL_FACES:
             yield found("mesh-huge", where, mesh=mesh, faces=faces, most=MAX_STL_FACES)
 
@@ -397,14 +402,14 @@ def _geometries(link: Link) -> dict[Geometry, None]:
 def is_readable(geometry: Geometry) -> bool:
     """Return whether a primitive has positive dimensions, or a mesh can be loaded."""
     if isinstance(geometry, Mesh):
-        return _is_scale_valid(geometry) and _mesh_fault(load_mesh, geometry) is None
+        return _is_scale_valid(geometry) and _mesh_fault(mesh_triangles, geometry) is None
     return all(math.isfinite(size) and size > 0 for size in dimensions(geometry))
 
 
 def has_hull(geometry: Geometry) -> bool:
     """Return whether a primitive has positive dimensions, or a mesh has a convex hull."""
     if isinstance(geometry, Mesh):
-        return _is_scale_valid(geometry) and _mesh_fault(convex_hull, geometry) is None
+        return _is_scale_valid(geometry) and _mesh_fault(hull_triangles, geometry) is None
     return is_readable(geometry)
 
 
@@ -413,7 +418,7 @@ def _is_scale_valid(mesh: Mesh) -> bool:
 
 
 def _mesh_fault(reader: Callable[[Mesh], object], mesh: Mesh) -> str | None:
-    """Return why ``load_mesh`` or ``convex_hull`` fails on a mesh; None if it succeeds."""
+    """Return why ``mesh_triangles`` or ``hull_triangles`` fails on a mesh; None if it succeeds."""
     try:
         reader(mesh)
     except MeshError as error:
@@ -540,10 +545,9 @@ def _triangles(shapes: Sequence[Shape], max_per_shape: int | None = None) -> _Tr
     """Return triangles of shapes in their link's frame, at most about ``max_per_shape`` of each."""
     pieces = []
     for shape in shapes:
-        geometry = shape.geometry
-        mesh = load_mesh(geometry) if isinstance(geometry, Mesh) else solid_mesh(geometry)
-        stride = 1 if max_per_shape is None else -(-len(mesh.faces) // max_per_shape)
-        corners = mesh.vertices[mesh.faces[::stride]]
+        vertices, faces = solid_triangles(shape.geometry)
+        stride = 1 if max_per_shape is None else -(-len(faces) // max_per_shape)
+        corners = vertices[faces[::stride]]
         pieces.append(_transform(corners, shape.T_link_shape.matrix))
     return np.concatenate(pieces)
 

@@ -15,14 +15,12 @@ from morphgen.checks import check
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, status, track
 from morphgen.errors import CompositionError, FormatError, MorphgenError
-from morphgen.fitting.replace_collision import with_geometry
 from morphgen.formats.bundle import CARD, URDF, bundle_folder, write_bundle
 from morphgen.formats.data_files import read_json
 from morphgen.formats.description import NamedDescription, find_description
 from morphgen.grammar.compose import compose as compose_parts
 from morphgen.grammar.part import part_manifest, write_part
 from morphgen.grammar.request import parse_words
-from morphgen.grammar.robot_source import import_robot, read_source
 from morphgen.model.robot import Joint, Robot
 
 _PARTS = Path("parts")
@@ -36,6 +34,8 @@ def compose(args: argparse.Namespace) -> int:
         derivation, name = parse_words(args.words, library)
         robot = compose_parts(derivation, library, name if args.name is None else args.name)
     if args.geometry != "mesh":
+        from morphgen.fitting.replace_collision import with_geometry
+
         with bar(args, "replacing collision meshes", "shape"):
             robot = with_geometry(robot, args.geometry, library.folders)
     data, text, code = write_checked(robot, args)
@@ -72,6 +72,8 @@ def write_checked(robot: Robot, args: argparse.Namespace) -> Written:
 
 def show(args: argparse.Namespace) -> None:
     """Print the link tree of one robot."""
+    from morphgen.grammar.robot_source import read_source
+
     sources = opt.sources_of(args)
     if len(sources) > 1:
         raise CompositionError(
@@ -238,6 +240,8 @@ def _import(
     args: argparse.Namespace,
 ) -> Written:
     """Import a robot, and write its bundle and, if asked for, its manifest."""
+    from morphgen.grammar.robot_source import import_robot
+
     licence = args.licence or description.licence
     if args.part and not licence:
         raise FormatError("--part: name the robot's licence by --licence, such as MIT")

@@ -17,8 +17,8 @@ from morphgen.checks.conformance import ConformanceRow, conformance
 from morphgen.doctor import Entry, attempt, failure
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import MorphgenError, PartError
+from morphgen.files import file_sha256
 from morphgen.formats.bundle import MJCF, write_bundle
-from morphgen.formats.files import file_sha256
 from morphgen.formats.picture import gl_context, render
 from morphgen.formats.resolve import REQUIREMENTS, distribution_file
 from morphgen.grammar.catalogue import source_digest, stored_facts

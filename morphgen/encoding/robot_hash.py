@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import replace
 
-from morphgen.formats.files import content_sha256
+from morphgen.files import content_sha256
 from morphgen.model.geometry import Geometry, Mesh, Pose, dimensions
 from morphgen.model.robot import (
     DEFAULT_EFFORT,

@@ -12,14 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from msgspec import field
-from trimesh.exchange.obj import export_obj
-from trimesh.exchange.stl import export_stl
 
 from morphgen.errors import FormatError
+from morphgen.files import file_sha256
 from morphgen.formats.data_files import read_json
 from morphgen.formats.description import read_description
 from morphgen.formats.files import (
-    file_sha256,
     folder_hashes,
     replacing_folder,
     require_unedited,
@@ -27,7 +25,6 @@ from morphgen.formats.files import (
 )
 from morphgen.formats.fits import FITS, find_fit, fits_text, read_fits, shapes_key
 from morphgen.formats.mjcf.write import mjcf_text
-from morphgen.formats.picture import render
 from morphgen.formats.records import FiniteNumber, Record, read_record
 from morphgen.formats.resolve import default_finder
 from morphgen.formats.rounding import round_number
@@ -37,7 +34,13 @@ from morphgen.model.dynamics import actuation
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh, Shape, StoredFits
 from morphgen.model.kinematics import arm_reach
-from morphgen.model.mesh import MAX_STL_FACES, load_mesh, mesh_parts, require_bounded_meshes
+from morphgen.model.mesh import (
+    MAX_STL_FACES,
+    kept_of_mesh,
+    load_mesh,
+    mesh_parts,
+    require_bounded_meshes,
+)
 from morphgen.model.robot import Robot
 
 URDF = "robot.urdf"
@@ -104,6 +107,8 @@ def write_bundle(
         card = robot_card(robot, findings, hashes, {"morphgen": version("morphgen")})
         (partial / CARD).write_text(card_text(card), encoding="utf-8")
         if picture:
+            from morphgen.formats.picture import render
+
             render(robot, partial / MJCF).save(partial / PICTURE)
     return folder
 
@@ -236,18 +241,25 @@ def write_meshes(robot: Robot, folder: Path) -> dict[Mesh, str]:
 
 def mesh_file(mesh: Mesh) -> tuple[str, bytes]:
     """Return the name and content of the file that every loader can read for a mesh."""
-    triangles = load_mesh(mesh)
-    if len(triangles.faces) <= MAX_STL_FACES:
-        data, suffix = export_stl(triangles), "stl"
-    else:  # too large for MuJoCo's STL reader
-        obj = export_obj(triangles, include_normals=False, header=None)
-        data, suffix = obj.encode(), "obj"
+    data, suffix = kept_of_mesh("file", mesh, lambda: _exported(mesh))
     digest = hashlib.sha256(data).hexdigest()[:8]
     # The name of a mesh that another bundle wrote already ends with a digest.
     base, dash, last_word = mesh.path.stem.rpartition("-")
     stem = base if dash and len(last_word) == 8 else mesh.path.stem
     safe_stem = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in stem)
     return f"{safe_stem}-{digest}.{suffix}", data
+
+
+def _exported(mesh: Mesh) -> tuple[bytes, str]:
+    """Return the triangles of a mesh as a file, and its suffix."""
+    from trimesh.exchange.obj import export_obj
+    from trimesh.exchange.stl import export_stl
+
+    triangles = load_mesh(mesh)
+    if len(triangles.faces) <= MAX_STL_FACES:
+        return export_stl(triangles), "stl"
+    # Too large for MuJoCo's STL reader.
+    return export_obj(triangles, include_normals=False, header=None).encode(), "obj"
 
 
 def write_fits(robot: Robot, folder: Path) -> None:

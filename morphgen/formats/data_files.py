@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import json
 import stat
+from collections.abc import Callable, Sequence
+from contextvars import ContextVar
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 
 from morphgen.errors import FormatError
+from morphgen.files import content_sha256, keep, read_kept
+
+T = TypeVar("T")
 
 MAX_FILE_BYTES = 64 * 2**20  # largest data file that is read [bytes]
 MAX_DEPTH = 100  # deepest nesting of lists and objects that is read
 MAX_YAML_VALUES = 1_000_000  # largest number of values in a YAML file, with every alias expanded
 
+_files_read: ContextVar[set[Path] | None] = ContextVar("files_read", default=None)
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -37,7 +43,33 @@ def read_bytes(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
         raise FormatError(f"{path}: {why}") from error
     if len(data) > max_bytes:
         raise FormatError(f"{path}: holds more than {max_bytes} bytes, the most that is read")
+    if (files := _files_read.get()) is not None:
+        files.add(path)
     return data
+
+
+def kept_reading(
+    kind: str, key: Sequence[object], read: Callable[[], T], types: Sequence[type] = ()
+) -> T:
+    """Return what is read from installed files, from the user's cache until one of them changes.
+
+    read: Reads them by ``read_bytes``, in this process.
+    types: See ``read_kept``.
+    """
+    try:
+        kept: tuple[dict[str, str], T] | None = read_kept(kind, key, types)
+        if kept and all(content_sha256(Path(name)) == hash_ for name, hash_ in kept[0].items()):
+            return kept[1]
+    except FormatError:  # a file is gone
+        pass
+    files: set[Path] = set()
+    token = _files_read.set(files)
+    try:
+        value = read()
+    finally:
+        _files_read.reset(token)
+    keep(kind, key, ({str(path): content_sha256(path) for path in files}, value))
+    return value
 
 
 def read_text(path: Path, max_bytes: int = MAX_FILE_BYTES) -> str:

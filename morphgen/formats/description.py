@@ -10,11 +10,21 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from morphgen.errors import FormatError, nearest
-from morphgen.formats.resolve import PackageFinder
+from morphgen.formats.data_files import kept_reading
+from morphgen.formats.resolve import (
+    PackageFinder,
+    default_finder,
+    distribution_file,
+    finds_installed_only,
+)
 from morphgen.formats.urdf.read import read_urdf, require_description_file, require_no_arguments
 from morphgen.formats.xml import root_tag
-from morphgen.model.robot import Robot
+from morphgen.model.findings import Finding
+from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
+from morphgen.model.robot import Frame, Inertial, Joint, Link, Mimic, Robot
 
+_ROBOT = (Robot, Link, Joint, Frame, Inertial, Mimic, Shape, Pose, Finding)
+_GEOMETRIES = (Box, Capsule, Cylinder, Mesh, Sphere)
 SUFFIXES = (".urdf", ".xacro", ".xml")  # file name suffixes of robot descriptions
 _MAX_HEAD = 2**20  # number of bytes within which the root element of an MJCF begins
 
@@ -35,6 +45,22 @@ def read_description(
         require_no_arguments(path, args)
         return read_mjcf(path, finder, root_body=root_link)
     return read_urdf(path, args, finder, written_frames=written_frames)
+
+
+def read_installed(package: str, file: str, args: Mapping[str, str]) -> Robot:
+    """Read a description of an installed data package, kept in the user's cache."""
+    path, finder = distribution_file(package, file), default_finder()
+
+    def read() -> Robot:
+        return read_description(path, args, finder)
+
+    if not finds_installed_only(finder):
+        return read()
+    key = (path, finder.roots, dict(args))
+    robot = kept_reading("robot", key, read, (*_ROBOT, *_GEOMETRIES))
+    shapes = (shape for link in robot.links for shape in (*link.visuals, *link.collisions))
+    meshes = (shape.geometry for shape in shapes if isinstance(shape.geometry, Mesh))
+    return robot if all(mesh.path.is_file() for mesh in meshes) else read()
 
 
 def is_mjcf(path: Path) -> bool:

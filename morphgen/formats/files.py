@@ -1,8 +1,7 @@
-"""Write files and folders atomically, lock folders against concurrent runs, and hash files."""
+"""Write folders atomically, and lock folders against concurrent runs."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -14,27 +13,12 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from morphgen.errors import FormatError, MorphgenError
+from morphgen.files import file_sha256, write_atomic
 from morphgen.formats.data_files import read_json
-from morphgen.formats.resolve import cached_until_changed
 
 SYSTEM_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
 """Files that file managers write into the folders that they show."""
 LOCK = ".lock"  # name of the lock file in a folder
-
-
-def file_sha256(path: Path) -> str:
-    """Return the SHA-256 of a file, hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-@cached_until_changed
-def content_sha256(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    try:
-        return file_sha256(path)
-    except OSError as error:
-        raise FormatError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 def folder_hashes(folder: Path) -> dict[str, str]:
@@ -94,12 +78,6 @@ def require_writable_folder(folder: Path) -> None:
         raise FormatError(f"cannot write to {folder}: {existing} cannot be written")
 
 
-def write_atomic(path: Path, content: str | bytes) -> None:
-    """Write a file by way of ``replacing_file``."""
-    with replacing_file(path) as partial:
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
-
-
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
     """Let an ``OSError`` without a file name, such as that of a full disk, name this file."""
@@ -123,29 +101,6 @@ def write_file(path: Path, content: str | bytes) -> None:
     """Write a file that the user named."""
     with writing(path):
         write_atomic(path, content)
-
-
-def write_cache_file(path: Path, content: str | bytes) -> None:
-    """Write a file of a cache and create its folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, content)
-
-
-@contextmanager
-def replacing_file(path: Path) -> Iterator[Path]:
-    """Yield a path in a temporary folder whose file replaces ``path`` if the block succeeds.
-
-    Concurrent processes may write the same file. An ``OSError`` names ``path``.
-    """
-    try:
-        # Only a rename within one file system is atomic.
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-            partial = Path(folder) / path.name
-            yield partial
-            partial.replace(path)
-    except OSError as error:
-        error.filename = str(path)
-        raise
 
 
 def leftovers(path: Path) -> set[Path]:

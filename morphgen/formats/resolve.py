@@ -6,20 +6,18 @@ import difflib
 import importlib.metadata
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.resources import files
 from itertools import product
 from pathlib import Path, PurePosixPath
-from typing import Literal, TypeVar
+from typing import Literal
 from urllib.parse import unquote
 
 from morphgen.errors import FormatError
 from morphgen.formats.xacro.evaluator import RefusedError
-
-T = TypeVar("T")
 
 REQUIREMENTS = {"rtb-data": "rtb-data==1.1.0", "example-robot-data": "example-robot-data"}
 """pip requirement of each distribution that provides robot files."""
@@ -280,23 +278,9 @@ def is_installed(path: Path) -> bool:
     return _is_in(path.resolve(), (*_morphgen_folders(), *_data_roots()))
 
 
-def file_stamp(path: Path) -> tuple[int, int]:
-    """Return modification time [ns] and size [bytes] of a file; zeros if it does not exist."""
-    if not path.is_file():
-        return (0, 0)
-    status = path.stat()
-    return (status.st_mtime_ns, status.st_size)
-
-
-def cached_until_changed(function: Callable[[Path], T]) -> Callable[[Path], T]:
-    """Cache the results of a function of a file; a file that changed is read again."""
-
-    @lru_cache(maxsize=4096)
-    def cached(path: Path, stamp: tuple[int, int]) -> T:
-        del stamp
-        return function(path)
-
-    return lambda path: cached(path.absolute(), file_stamp(path))
+def finds_installed_only(finder: PackageFinder) -> bool:
+    """Return whether a finder finds packages of the installed data packages only."""
+    return finder.root is None and {*finder.roots} <= {*_data_roots()}
 
 
 def portable_uri(path: Path) -> str:

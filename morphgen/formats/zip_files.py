@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.errors import FormatError, shortened
-from morphgen.formats.files import replacing_file, writing
+from morphgen.files import replacing_file
+from morphgen.formats.files import writing
 
 _ENTRY_SIGNATURE = b"PK\x01\x02"  # first bytes of every entry in a zip's table of contents
 _COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)

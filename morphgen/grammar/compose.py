@@ -8,12 +8,14 @@ from functools import lru_cache
 
 from morphgen.checks.self_collision import CollisionSurvey, survey_collisions
 from morphgen.errors import CompositionError, nearest
+from morphgen.files import keep, read_kept
 from morphgen.formats.fits import with_stored_fits
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import MOUNT_YAW, MOUNT_YAW_PARAMETER, require_range
 from morphgen.grammar.part import Part, load_part
-from morphgen.model.geometry import IDENTITY, Pose
+from morphgen.model.geometry import IDENTITY, Mesh, Pose
+from morphgen.model.mesh import mesh_key
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Pair, Robot, sorted_pair
 from morphgen.model.rotation import from_rpy
 
@@ -234,4 +236,13 @@ def survey_contacts(robot: Robot, derivation: Derivation, library: Library) -> C
 @lru_cache(maxsize=256)
 def _ignored_in_part(part: Part) -> tuple[Pair, ...]:
     """Return the pairs of a part's own links whose contacts are ignored."""
-    return survey_collisions(part.fragment).ignore_pairs
+    fragment = part.fragment
+    collisions = (shape.geometry for link in fragment.links for shape in link.collisions)
+    key = (fragment, *(mesh_key(each) for each in collisions if isinstance(each, Mesh)))
+    if None in key:
+        return survey_collisions(fragment).ignore_pairs
+    pairs: tuple[Pair, ...] | None = read_kept("pairs", key)
+    if pairs is None:
+        pairs = survey_collisions(fragment).ignore_pairs
+        keep("pairs", key, pairs)
+    return pairs

@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 from morphgen.arguments import path_argument
 from morphgen.errors import PartError, nearest
-from morphgen.formats.resolve import cached_until_changed
+from morphgen.files import cached_until_changed
 from morphgen.grammar.manifest import PART_KINDS, Manifest, PartKind, read_manifest
 
 LIBRARY_VARIABLE = "MORPHGEN_LIBRARY"

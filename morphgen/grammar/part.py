@@ -21,14 +21,13 @@ from morphgen.errors import (
     RobotError,
     nearest,
 )
-from morphgen.formats.description import is_mjcf, read_description
-from morphgen.formats.files import write_atomic
-from morphgen.formats.resolve import PackageFinder, distribution_file, file_stamp
+from morphgen.files import file_stamp, write_atomic
+from morphgen.formats.description import is_mjcf, read_description, read_installed
+from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.rounding import format_number
 from morphgen.formats.urdf.read import robot_from_xml
 from morphgen.formats.xacro.compile import CompiledXacro, compile_xacro
 from morphgen.formats.xacro.evaluator import evaluate_number
-from morphgen.formats.xacro.expand import expand
 from morphgen.grammar.library import Library, shipped_folders
 from morphgen.grammar.manifest import (
     FrameSpec,
@@ -120,7 +119,7 @@ class _Loader:
         source = self._manifest.source
         try:
             if isinstance(source, PackageSource):
-                return read_description(distribution_file(source.package, source.file), source.args)
+                return read_installed(source.package, source.file, source.args)
             if is_mjcf(source):
                 return read_description(source)
             return self._read_template(source)
@@ -139,6 +138,8 @@ class _Loader:
         # Sampling expands the same template thousands of times.
         compiled = compile_xacro(path, constants, numbers, finder)
         if compiled is None:
+            from morphgen.formats.xacro.expand import expand
+
             return robot_from_xml(expand(path, {**constants, **numbers}, finder), path, finder)
         text = compiled.fill(numbers)
         robot = robot_from_xml(text, path, finder, trusted=compiled in _trusted)

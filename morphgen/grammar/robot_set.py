@@ -24,16 +24,10 @@ from typing import Any
 import msgspec
 
 from morphgen.errors import FormatError, MorphgenError
+from morphgen.files import write_atomic
 from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.formats.data_files import read_json, read_text
-from morphgen.formats.files import (
-    leftovers,
-    locked_folder,
-    naming,
-    replacing_folder,
-    write_atomic,
-    writing,
-)
+from morphgen.formats.files import leftovers, locked_folder, naming, replacing_folder, writing
 from morphgen.formats.records import FiniteNumber
 from morphgen.formats.resolve import portable_uri
 from morphgen.formats.rounding import round_number

@@ -141,6 +141,17 @@ class MeshPart(NamedTuple):
     faces: NDArray[np.int64]  # shape (m, 3)
 
 
+@dataclass(frozen=True)
+class MeshContent:
+    """The content of a mesh file."""
+
+    parts: tuple[MeshPart, ...]  # one for each geometry
+    left_out: tuple[str, ...]
+    """Content that was not read, each a phrase with a count, such as ``3 line sets``."""
+    pixels: int  # number of pixels of the textures that were read, each use counted
+    self_contained: bool  # whether the file names no other file
+
+
 Primitive = Box | Sphere | Cylinder | Capsule
 Geometry = Primitive | Mesh
 

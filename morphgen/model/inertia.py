@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from morphgen.errors import RobotError
+from morphgen.files import keep, read_kept
 from morphgen.model.geometry import (
     Box,
     Capsule,
@@ -22,10 +23,11 @@ from morphgen.model.geometry import (
     Primitive,
     Shape,
     Sphere,
+    dimensions,
     half_extents,
     volume,
 )
-from morphgen.model.mesh import convex_hull, load_mesh
+from morphgen.model.mesh import Triangles, convex_hull, load_mesh, mesh_key, mesh_triangles
 from morphgen.model.robot import Inertial, Link
 from morphgen.typing import Array
 
@@ -81,6 +83,28 @@ def _union_moments(shapes: tuple[Shape, ...], _stamps: tuple[int, ...]) -> Array
 
     It holds the second moments [m^5], the first ones [m^4] and the volume [m^3].
     """
+    key = [
+        (_geometry_key(shape.geometry), shape.T_link_shape.position, shape.T_link_shape.quaternion)
+        for shape in shapes
+    ]
+    is_known = all(geometry is not None for geometry, _, _ in key)
+    if not is_known or not any(isinstance(shape.geometry, Mesh) for shape in shapes):
+        return _make_moments(shapes)
+    found: Array | None = read_kept("moments", key)
+    if found is None:
+        found = _make_moments(shapes)
+        keep("moments", key, found)
+    return found
+
+
+def _geometry_key(geometry: Geometry) -> tuple[object, ...] | None:
+    """Return what identifies a geometry; None for a mesh of which nothing is kept."""
+    if isinstance(geometry, Mesh):
+        return mesh_key(geometry)
+    return (type(geometry).__name__, *dimensions(geometry))
+
+
+def _make_moments(shapes: tuple[Shape, ...]) -> Array:
     total = sum(map(_moments, shapes), np.zeros((4, 4)))
     boxes = [bounding_box([shape]) for shape in shapes]
     if not any(
@@ -119,6 +143,34 @@ def solid_mesh(geometry: Geometry) -> trimesh.Trimesh:
             mesh = load_mesh(geometry)
             mesh = mesh if mesh.is_volume else convex_hull(geometry)
     return mesh
+
+
+def solid_triangles(geometry: Geometry) -> Triangles:
+    """Return the triangles of a mesh file, or those of ``solid_mesh`` for a primitive.
+
+    Spheres differ from those of ``solid_mesh`` by rounding.
+    """
+    if isinstance(geometry, Mesh):
+        return mesh_triangles(geometry)
+    if isinstance(geometry, Capsule):
+        mesh = solid_mesh(geometry)
+        return Triangles(np.array(mesh.vertices), np.array(mesh.faces))
+    vertices, faces = _unit_solid(type(geometry).__name__)
+    sizes = dimensions(geometry)
+    scale = {1: sizes * 3, 2: (sizes[0], *sizes)}.get(len(sizes), sizes)
+    return Triangles(vertices * scale, faces)
+
+
+@lru_cache(maxsize=3)
+def _unit_solid(kind: str) -> Triangles:
+    """Return the triangles of a primitive whose dimensions are all 1, from the user's cache."""
+    found: Triangles | None = read_kept("solid", (kind,), (Triangles,))
+    if found is None:
+        units = (Box((1.0, 1.0, 1.0)), Sphere(1.0), Cylinder(1.0, 1.0))
+        mesh = solid_mesh(next(unit for unit in units if type(unit).__name__ == kind))
+        found = Triangles(np.array(mesh.vertices), np.array(mesh.faces))
+        keep("solid", (kind,), found)
+    return found
 
 
 def link_frame_mesh(shape: Shape) -> trimesh.Trimesh:
@@ -165,7 +217,7 @@ def _cache_key(shapes: Sequence[Shape]) -> tuple[tuple[Shape, ...], tuple[int, .
 def _corners(shape: Shape) -> Array:
     """Return the corners of a primitive's bounding box, or a mesh's vertices, in the link frame."""
     if isinstance(shape.geometry, Mesh):
-        corners = np.asarray(load_mesh(shape.geometry).vertices)
+        corners = mesh_triangles(shape.geometry).vertices
     else:
         corners = _CORNER_SIGNS * half_extents(shape.geometry)
     T = shape.T_link_shape.matrix

@@ -1,27 +1,33 @@
-"""Triangles of mesh files, in metres: loading, colour groups and convex hulls, all cached."""
+"""Triangles of mesh files, in metres: loading, colour groups and convex hulls, all cached.
+
+What is computed of a mesh is kept in the user's cache, too, so that commands start without trimesh
+and SciPy, whose import takes longer than composing a robot.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.errors import MeshError
-from morphgen.model.geometry import Mesh, MeshPart, Rgba
+from morphgen.files import content_sha256, keep, read_kept
+from morphgen.model.geometry import Mesh, MeshContent, MeshPart, Rgba
 from morphgen.typing import Array
 
 if TYPE_CHECKING:
     import trimesh
 
-    from morphgen.model.mesh_files import MeshContent
     from morphgen.model.robot import Robot
+
+T = TypeVar("T")
 
 MAX_STL_FACES = 200_000  # number of triangles of the largest STL file that MuJoCo reads
 MAX_ROBOT_BYTES = 96 * 2**20
@@ -33,12 +39,23 @@ MAX_ROBOT_PIXELS = 2**26  # number of pixels in all textures of a robot's mesh f
 FLATNESS_TOLERANCE = 1e-7  # ratio of thickness to size below which points count as flat
 
 
+class Triangles(NamedTuple):
+    """Triangles of a mesh; treat them as read-only."""
+
+    vertices: Array  # shape (n, 3) [m]
+    faces: NDArray[np.int64]  # shape (m, 3)
+
+
 def load_mesh(mesh: Mesh) -> trimesh.Trimesh:
+    """Return the triangles of a mesh as an object of trimesh; see ``mesh_triangles``."""
+    return _loaded(replace(mesh, path=mesh.path.absolute()), _stamp(mesh.path), hull=False)
+
+
+def mesh_triangles(mesh: Mesh) -> Triangles:
     """Return the triangles of a mesh in the frame of its URDF ``<mesh>`` [m], scale applied.
 
     Coincident vertices are merged, triangles without area are removed, and a mirroring scale keeps
-    the normals pointing outwards. The result is cached until the file changes; treat it as
-    read-only.
+    the normals pointing outwards. The result is cached until the file changes.
     """
     return _scaled(replace(mesh, path=mesh.path.absolute()), _stamp(mesh.path))
 
@@ -85,7 +102,12 @@ def left_out(path: Path) -> tuple[str, ...]:
 
 
 def convex_hull(mesh: Mesh) -> trimesh.Trimesh:
-    """Return the convex hull of a mesh [m]; cached, so treat it as read-only."""
+    """Return the convex hull of a mesh as an object of trimesh; see ``hull_triangles``."""
+    return _loaded(replace(mesh, path=mesh.path.absolute()), _stamp(mesh.path), hull=True)
+
+
+def hull_triangles(mesh: Mesh) -> Triangles:
+    """Return the triangles of the convex hull of a mesh [m]; cached until the file changes."""
     return _hull(replace(mesh, path=mesh.path.absolute()), _stamp(mesh.path))
 
 
@@ -97,21 +119,60 @@ def is_flat(points: Array) -> bool:
     return bool(spread[2] <= FLATNESS_TOLERANCE * spread[0])
 
 
+def kept_of_mesh(kind: str, mesh: Mesh, make: Callable[[], T], *types: type) -> T:
+    """Return what is computed of a mesh, from the user's cache if it is there.
+
+    Nothing is kept of a file that names others, which may change. Nor of a mesh with a factor that
+    is no power of ten: it may have been drawn, and is hardly ever seen again.
+    """
+    if (key := mesh_key(mesh)) is None:
+        return make()
+    found: T | None = read_kept(kind, key, types)
+    if found is None:
+        found = make()
+        if _content(mesh.path).self_contained:
+            keep(kind, key, found)
+    return found
+
+
+def mesh_key(mesh: Mesh) -> tuple[object, ...] | None:
+    """Return what identifies the content of a mesh; None for one of which nothing is kept."""
+    path = mesh.path
+    if not all(factor and math.log10(abs(factor)).is_integer() for factor in mesh.scale):
+        return None
+    if not path.is_file() or path.stat().st_size > MAX_ROBOT_BYTES:  # a pipe may never end
+        return None
+    return (content_sha256(path), path.suffix.lower(), mesh.scale, mesh.part)
+
+
 @lru_cache(maxsize=512)
-def _hull(mesh: Mesh, stamp: tuple[int, int]) -> trimesh.Trimesh:
-    import trimesh  # here and below, because commands that read no mesh should start quickly
+def _loaded(mesh: Mesh, stamp: tuple[int, int], *, hull: bool) -> trimesh.Trimesh:
+    import trimesh  # here and below, because commands that change no mesh should start quickly
 
-    vertices = _scaled(mesh, stamp).vertices
-    if is_flat(vertices):
-        raise MeshError(f"{mesh.path}: is flat, so it has no convex hull")
-    result: trimesh.Trimesh = trimesh.convex.convex_hull(vertices)
-    return result
+    triangles = _hull(mesh, stamp) if hull else _scaled(mesh, stamp)
+    return trimesh.Trimesh(*triangles, process=False)
 
 
 @lru_cache(maxsize=512)
-def _scaled(mesh: Mesh, _stamp: tuple[int, int]) -> trimesh.Trimesh:
-    import trimesh
+def _hull(mesh: Mesh, stamp: tuple[int, int]) -> Triangles:
+    def make() -> Triangles:
+        import trimesh
 
+        vertices = _scaled(mesh, stamp).vertices
+        if is_flat(vertices):
+            raise MeshError(f"{mesh.path}: is flat, so it has no convex hull")
+        hull: trimesh.Trimesh = trimesh.convex.convex_hull(vertices)
+        return Triangles(np.array(hull.vertices), np.array(hull.faces))
+
+    return kept_of_mesh("hull", mesh, make, Triangles)
+
+
+@lru_cache(maxsize=512)
+def _scaled(mesh: Mesh, _stamp: tuple[int, int]) -> Triangles:
+    return kept_of_mesh("triangles", mesh, lambda: _make_scaled(mesh), Triangles)
+
+
+def _make_scaled(mesh: Mesh) -> Triangles:
     path, scale, part = mesh.path, mesh.scale, mesh.part
     if len(scale) != 3 or not all(math.isfinite(s) and s != 0 for s in scale):
         raise MeshError(f"{path}: scale {scale} is not three finite numbers other than zero")
@@ -125,7 +186,7 @@ def _scaled(mesh: Mesh, _stamp: tuple[int, int]) -> trimesh.Trimesh:
     vertices, faces = _clean(vertices * scale, faces[:, ::-1] if math.prod(scale) < 0 else faces)
     if not len(faces):
         raise MeshError(f"{path}: no triangle has an area at scale {scale}")
-    return trimesh.Trimesh(vertices, faces, process=False)
+    return Triangles(vertices, faces)
 
 
 def _content(path: Path) -> MeshContent:
@@ -139,6 +200,11 @@ def _content(path: Path) -> MeshContent:
 @lru_cache(maxsize=128)
 def _content_or_fault(path: str, stamp: tuple[int, int]) -> MeshContent | str:
     """Return what a file holds, or why it is refused: a large one is refused only once."""
+    key = mesh_key(Mesh(Path(path)))
+    if key is not None:
+        found: MeshContent | None = read_kept("content", key, (MeshContent, MeshPart))
+        if found is not None:
+            return found
     from morphgen.model.mesh_files import read_mesh_file
 
     try:
@@ -154,7 +220,10 @@ def _content_or_fault(path: str, stamp: tuple[int, int]) -> MeshContent | str:
     if not parts:
         count = sum(len(part.faces) for part in content.parts)
         return f"{path}: none of its {count} triangles has an area"
-    return replace(content, parts=parts)
+    content = replace(content, parts=parts)
+    if key is not None and content.self_contained:
+        keep("content", key, content)
+    return content
 
 
 def _joined(rgba: Rgba | None, parts: Sequence[MeshPart]) -> MeshPart:

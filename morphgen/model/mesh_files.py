@@ -11,7 +11,6 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from morphgen.errors import MeshError
-from morphgen.model.geometry import MESH_SUFFIXES, MeshPart
+from morphgen.model.geometry import MESH_SUFFIXES, MeshContent, MeshPart
 from morphgen.model.scene_files import (
     MAX_SETS,
     UNREADABLE,
@@ -46,16 +45,6 @@ _MAX_HEADER = 2**16
 """Size of the longest header of a PLY file, and of the longest line of an OBJ file [bytes]."""
 
 
-@dataclass(frozen=True)
-class MeshContent:
-    """The content of a mesh file."""
-
-    parts: tuple[MeshPart, ...]  # one for each geometry
-    left_out: tuple[str, ...]
-    """Content that was not read, each a phrase with a count, such as ``3 line sets``."""
-    pixels: int  # number of pixels of the textures that were read, each use counted
-
-
 def read_mesh_file(path: Path) -> MeshContent:
     """Return the coloured triangles of a mesh file, and what was left out."""
     suffix = path.suffix.lower()
@@ -73,7 +62,7 @@ def read_mesh_file(path: Path) -> MeshContent:
     notes = [
         f"{note} ({n} times)" if n > 1 else note for note, n in Counter(files.left_out).items()
     ]
-    return MeshContent(tuple(parts), tuple(notes), files.pixels)
+    return MeshContent(tuple(parts), tuple(notes), files.pixels, files.reads == 1)
 
 
 def _require_mesh(data: bytes, suffix: str) -> None:

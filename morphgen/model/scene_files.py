@@ -103,6 +103,7 @@ class FolderResolver(trimesh.resolvers.Resolver):
         self._folder = folder.resolve()
         self._bytes_left = 2 * MAX_FILE_SIZE
         self._pixels_left = MAX_PIXELS
+        self.reads = 0  # number of files that were asked for
         self.written: dict[str, bytes] = {}
         """Content of files that exist only here, by name."""
         self.left_out: list[str] = []
@@ -112,6 +113,7 @@ class FolderResolver(trimesh.resolvers.Resolver):
         """Return the content of a file."""
         if name in self.written:
             return self.written[name]
+        self.reads += 1
         path = (self._folder / str(name).strip().replace("\\", "/")).resolve()
         if not path.is_relative_to(self._folder):
             raise ValueError(f"{name!r} is outside the mesh's folder")

@@ -17,8 +17,9 @@ from msgspec import Meta
 
 from morphgen.encoding.robot_hash import HASH_LENGTH
 from morphgen.errors import BenchmarkError, nearest
+from morphgen.files import write_atomic
 from morphgen.formats.data_files import parse_yaml, read_text
-from morphgen.formats.files import write_atomic, writing
+from morphgen.formats.files import writing
 from morphgen.formats.records import Record, read_record
 from morphgen.splits.split import FORMAT, SIDES, Member, Regime, Split, split_id
 

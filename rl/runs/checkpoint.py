@@ -21,8 +21,9 @@ import torch
 
 from morphgen.encoding.tokens import MAX_LINKS
 from morphgen.errors import MALFORMED, MorphgenError, TaskError, nearest, shortened
+from morphgen.files import write_atomic
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import LOCK, leftovers, write_atomic, writing
+from morphgen.formats.files import LOCK, leftovers, writing
 from morphgen.formats.records import Record, read_record
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import PolicyConfig, PPOConfig, differences, policy_from, read_fields

@@ -21,8 +21,9 @@ import torch
 
 from morphgen.encoding.tokens import require_max_links
 from morphgen.errors import FormatError, MissingDependencyError, TaskError
+from morphgen.files import write_atomic
 from morphgen.formats.data_files import parse_json, read_text
-from morphgen.formats.files import locked_folder, naming, write_atomic
+from morphgen.formats.files import locked_folder, naming
 from morphgen.formats.records import read_record
 from morphgen.model.kinematics import driving_joints
 from morphgen.model.robot import TOOL, Robot

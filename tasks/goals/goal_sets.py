@@ -23,7 +23,7 @@ from platformdirs import user_cache_path
 
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import BenchmarkError, TaskError
-from morphgen.formats.files import write_cache_file
+from morphgen.files import write_cache_file
 from morphgen.formats.zip_files import read_npz
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import Robot

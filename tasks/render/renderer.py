@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from morphgen.errors import FormatError
+from morphgen.files import replacing_file
 from morphgen.formats.bundle import split_colours
-from morphgen.formats.files import replacing_file, require_writable_file
+from morphgen.formats.files import require_writable_file
 from morphgen.formats.mjcf.write import to_spec
 from morphgen.formats.picture import gl_context
 from morphgen.model.inertia import bounding_box, box_corners

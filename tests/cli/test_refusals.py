@@ -23,7 +23,7 @@ from morphgen import cli
 from morphgen.api.export import FILES
 from morphgen.cli.command import whole_number
 from morphgen.errors import MorphgenError
-from morphgen.formats import bundle
+from morphgen.formats import bundle, picture
 from morphgen.splits.split_file import split_text
 from morphgen.tasks.registry import TASKS
 
@@ -463,7 +463,7 @@ def interrupt(*_):
 @pytest.mark.parametrize("step", ["urdf_text", "mjcf_text", "card_text", "render"])
 def test_interrupted_run_leaves_no_partial_bundle(run, tmp_path, monkeypatch, step):
     (tmp_path / "out").mkdir()
-    monkeypatch.setattr(bundle, step, interrupt)
+    monkeypatch.setattr(picture if step == "render" else bundle, step, interrupt)
     code, out, err = run("compose", "base=gantry", "ee=plane", "--out", "out")
     assert (code, out) == (130, "")
     assert err == "morphgen: interrupted; nothing half-written is left\n"

@@ -16,10 +16,11 @@ from morphgen.benchmark import release, split_folder
 from morphgen.benchmark.scores import submission
 from morphgen.encoding.robot_hash import digest, robot_hash
 from morphgen.encoding.tokens import FREQUENCIES, KINDS, LAYOUT, MAX_LINKS, SHAPES, tokens
+from morphgen.files import file_sha256
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats import bundle
 from morphgen.formats.bundle import CARD, write_bundle
-from morphgen.formats.files import file_sha256, folder_hashes
+from morphgen.formats.files import folder_hashes
 from morphgen.grammar.compose import compose
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import default_library

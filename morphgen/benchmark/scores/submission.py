@@ -33,8 +33,9 @@ from msgspec import Meta
 
 from morphgen.benchmark.eval_protocol import EvalProtocol, ExpectedRobot
 from morphgen.errors import BenchmarkError
+from morphgen.files import write_atomic
 from morphgen.formats.data_files import parse_json, read_bytes, read_json
-from morphgen.formats.files import LOCK, write_atomic
+from morphgen.formats.files import LOCK
 from morphgen.formats.records import Record, dotted_values, read_record
 from morphgen.rl.scores import LISTS, Count, Name, RobotOutcomes, Score
 from morphgen.splits.split import Split, split_id

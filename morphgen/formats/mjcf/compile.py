@@ -19,7 +19,7 @@ from platformdirs import user_cache_path
 from trimesh.exchange.stl import export_stl
 
 from morphgen.errors import FormatError
-from morphgen.formats.files import write_cache_file
+from morphgen.files import write_cache_file
 from morphgen.formats.mjcf.document import GEOM_TYPES, MjcfDocument, listed
 from morphgen.formats.quiet import MujocoWarnings
 from morphgen.formats.urdf.schema import MAX_LINKS, MAX_NUMBER, MAX_SHAPES, MAX_TEXT

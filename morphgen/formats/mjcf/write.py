@@ -8,7 +8,6 @@ from pathlib import PurePosixPath
 
 import mujoco
 import numpy as np
-import trimesh
 from lxml import etree
 
 from morphgen.errors import FormatError
@@ -17,7 +16,7 @@ from morphgen.formats.urdf.write import MUJOCO_BOUNDS
 from morphgen.model.dynamics import Actuation, actuation, armature
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.kinematics import movable_positions
-from morphgen.model.mesh import convex_hull, load_mesh
+from morphgen.model.mesh import hull_triangles, mesh_triangles
 from morphgen.model.robot import TOOL, Joint, Link, Robot
 from morphgen.model.tree import take_name
 from morphgen.typing import Array
@@ -62,8 +61,8 @@ class Meshes:
         for (mesh, collision), name in self._names.items():
             if name in self._vertices:
                 continue
-            triangles = convex_hull(mesh) if collision else load_mesh(mesh)
-            vertices = np.asarray(triangles.vertices, dtype=np.float64)
+            triangles = hull_triangles(mesh) if collision else mesh_triangles(mesh)
+            vertices = triangles.vertices
             missing = max(0, 4 - len(vertices))  # MuJoCo refuses meshes of fewer than four vertices
             spec.add_mesh(
                 name=name,
@@ -74,7 +73,7 @@ class Meshes:
 
     def _add(self, mesh: Mesh, collision: bool) -> str:
         if collision:
-            corners = _thickened(np.asarray(load_mesh(mesh).vertices, dtype=np.float64))
+            corners = _thickened(mesh_triangles(mesh).vertices)
             if corners is not None:
                 name = take_name(f"{mesh.path.stem}_flat", self._taken)
                 self._vertices[name] = corners
@@ -131,6 +130,8 @@ def _thickened(vertices: Array) -> Array | None:
     _, axes = np.linalg.eigh(centred.T @ centred)
     if np.ptp(centred @ axes[:, 0]) >= FLAT:
         return None
+    import trimesh  # here, because few robots have flat meshes
+
     shift = axes[:, 0] * FLAT_THICKNESS / 2
     sides = np.concatenate([vertices + shift, vertices - shift])
     return np.asarray(trimesh.convex.convex_hull(sides).vertices, dtype=np.float64)

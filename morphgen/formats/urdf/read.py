@@ -24,7 +24,6 @@ from morphgen.formats.resolve import (
 )
 from morphgen.formats.urdf.schema import CHILDREN, above_free_base, structure_findings
 from morphgen.formats.urdf.write import MORPHGEN_TAG, joined_capsules
-from morphgen.formats.xacro.expand import expand
 from morphgen.formats.xml import parse_description
 from morphgen.model import rotation
 from morphgen.model.findings import Finding
@@ -89,6 +88,8 @@ def read_urdf(
 def urdf_bytes(path: Path, args: Mapping[str, str], finder: PackageFinder) -> bytes:
     """Return the content of a URDF, or of a xacro (by its suffix) when expanded."""
     if path.suffix == ".xacro":
+        from morphgen.formats.xacro.expand import expand  # loads xacro and minidom
+
         return expand(path, args, finder)
     require_no_arguments(path, args)
     return read_bytes(path, MAX_URDF_BYTES)

@@ -18,9 +18,9 @@ from functools import lru_cache
 from pathlib import Path
 
 from morphgen.errors import FormatError
-from morphgen.formats.resolve import PackageFinder, is_installed
+from morphgen.formats.data_files import kept_reading
+from morphgen.formats.resolve import PackageFinder, finds_installed_only, is_installed
 from morphgen.formats.xacro.evaluator import Expression, Function, RefusedError
-from morphgen.formats.xacro.expand import Expansion, run_in_child
 
 _OPEN, _CLOSE = "\ue000", "\ue001"  # private-use characters: documents hardly have them
 _MARK = re.compile(f"{_OPEN}(.*?){_CLOSE}", re.DOTALL)
@@ -141,11 +141,19 @@ def _compiled(
     del stamp
     path = path.absolute()
     given = dict(constants)
+
+    def read() -> tuple[Sequence[str], Sequence[str]] | None:
+        return trace(path, finder, given, example, installed_only=True)
+
     try:
-        if is_installed(path):
-            traced = trace(path, finder, given, example, installed_only=True)
-        else:
+        if not is_installed(path):
+            from morphgen.formats.xacro.expand import run_in_child
+
             traced = run_in_child(trace, path, finder, constants=given, numbers=example)
+        elif finds_installed_only(finder):
+            traced = kept_reading("template", (path, constants, tuple(example)), read)
+        else:
+            traced = read()
         return None if traced is None else _translated(*traced)
     except _UNTRACEABLE:
         return None
@@ -164,6 +172,8 @@ def trace(
     Returns:
         The texts and the expressions of a ``CompiledXacro``; None as for ``compile_xacro``.
     """
+    from morphgen.formats.xacro.expand import Expansion  # loads xacro and minidom
+
     objects = {name: Traced(_symbol(name)) for name in numbers}
     functions = {name: Function(name, _lifted(name, call)) for name, call in _FUNCTIONS.items()}
     expansion = Expansion(
