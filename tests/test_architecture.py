@@ -26,6 +26,7 @@ PACKAGES = (
     "arguments",
     "extras",
     "typing",
+    "files",
     "progress",
     "processes",
     "tables",
