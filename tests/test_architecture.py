@@ -160,6 +160,42 @@ def test_reading_manifests_loads_no_simulator(module):
     assert loaded.isdisjoint(SIMULATORS_AND_MESHES)
 
 
+def modules_of_command(folder, *words):
+    """Return the modules that a command loads, with a cache in the folder."""
+    code = (
+        "import sys; from morphgen.cli import main; code = main(sys.argv[1:]); "
+        "print(*sorted(sys.modules)); sys.exit(code)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=folder,
+        env={**os.environ, "XDG_CACHE_HOME": str(folder / "cache")},
+    )
+    return set(done.stdout.splitlines()[-1].split())
+
+
+def test_a_list_loads_neither_numpy_nor_a_parser(tmp_path):
+    loaded = modules_of_command(tmp_path, "list", "arms")
+    assert "morphgen.cli.lists" in loaded
+    others = {"numpy", "lark", "lxml", "tqdm", "multiprocessing", "morphgen.model.robot"}
+    assert loaded.isdisjoint({*SIMULATORS_AND_MESHES, *others})
+
+
+@pytest.mark.slow
+def test_composing_loads_no_reader_of_what_is_kept(tmp_path):
+    words = ("compose", "arm=px100", "ee=plane", "--no-picture")
+    first, again = (modules_of_command(tmp_path, *words) for _ in range(2))
+    heavy = {"trimesh", "scipy", "networkx", "PIL", "xacro", "xml.dom", "morphgen.formats._xacro"}
+    assert {"trimesh", "scipy", "morphgen.formats._xacro"} <= first
+    assert {"mujoco", "morphgen.formats.bundle"} <= again
+    assert again.isdisjoint({*heavy, *SIMULATORS_AND_MESHES, "igl", "tqdm"} - {"mujoco"})
+    rooms = ("fitting", "formats.mjcf.read", "model.mesh_files", "grammar.robot_source")
+    assert again.isdisjoint(f"morphgen.{room}" for room in rooms)
+
+
 def test_importing_the_checks_loads_no_simulator():
     loaded = modules_after("import morphgen.checks")
     assert loaded.isdisjoint({*SIMULATORS_AND_MESHES, "fcl", "igl", "lxml", "scipy"})
