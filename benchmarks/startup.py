@@ -1,6 +1,6 @@
 """Start-up time of commands, compared with importing NumPy and MuJoCo in the same run.
 
-    python benchmarks/startup.py [--repeats 9]
+    python benchmarks/startup.py [--repeats 5]
 
 Prints the median wall and CPU time of whole processes, and their ratios to
 `python -c "import numpy, mujoco"`, whose runs alternate with those of the commands. On a busy
@@ -33,7 +33,6 @@ COMMANDS = {
     "morphgen compose arm=ur5 ee=plane --no-picture": [*COMPOSE, "--no-picture"],
     "morphgen compose arm=ur5 ee=plane": COMPOSE,
     "morphgen check ur5-plane": ["-m", "morphgen", "check", "ur5-plane"],
-    "morphgen sample arm3 -n 50": ["-m", "morphgen", "sample", "arm3", "-n", "50", "--out", "set"],
     "cold: morphgen compose arm=ur5 ee=plane --no-picture": [*COMPOSE, "--no-picture"],
 }
 
@@ -43,7 +42,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--repeats", type=int, default=5)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as kept:
         times = [

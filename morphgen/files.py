@@ -106,6 +106,8 @@ def _warn_of(folder: Path, reason: str | None, what: str) -> None:
 KEPT = "compiled-1"
 """Folder of kept values in the user's cache; the number rises when the same key gets another
 value, or the form of an entry changes."""
+_ROOMS = ("model", "formats", "formats/mjcf", "formats/urdf", "formats/xacro", "checks")
+"""Folders of the modules that compute kept values."""
 MAX_KEPT = 2**29
 """Size of all kept values above which those are removed that were not used for longest [bytes]."""
 _USED_AGAIN = 86_400.0  # time after which reading an entry counts as a new use [s]
@@ -159,11 +161,17 @@ def _kept_path(kind: str, key: Sequence[object]) -> Path:
 
 
 @lru_cache(maxsize=1)
-def _versions() -> tuple[str, ...]:
-    """Return the versions of the packages that compute kept values."""
+def _versions() -> tuple[object, ...]:
+    """Return what tells versions of the code that computes kept values apart."""
     from importlib.metadata import version
 
-    return tuple(map(version, ("morphgen", "mujoco", "trimesh")))
+    modules = (
+        entry.stat().st_mtime_ns  # a developer's change counts as a version, too
+        for room in _ROOMS
+        for entry in os.scandir(Path(__file__).parent / room)
+        if entry.name.endswith(".py")
+    )
+    return (*map(version, ("morphgen", "mujoco", "trimesh")), max(modules))
 
 
 def _make_room(folder: Path, size: int) -> None:

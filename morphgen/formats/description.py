@@ -16,6 +16,7 @@ from morphgen.formats.resolve import (
     default_finder,
     distribution_file,
     finds_installed_only,
+    is_installed,
 )
 from morphgen.formats.urdf.read import read_urdf, require_description_file, require_no_arguments
 from morphgen.formats.xml import root_tag
@@ -54,7 +55,7 @@ def read_installed(package: str, file: str, args: Mapping[str, str]) -> Robot:
     def read() -> Robot:
         return read_description(path, args, finder)
 
-    if not finds_installed_only(finder):
+    if not (is_installed(path) and finds_installed_only(finder)):
         return read()
     key = (path, finder.roots, dict(args))
     robot = kept_reading("robot", key, read, (*_ROBOT, *_GEOMETRIES))

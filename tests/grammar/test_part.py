@@ -11,9 +11,9 @@ from helpers.parts import PINCER, write_part
 from morphgen.checks import rules
 from morphgen.checks.rules import check_links_apart
 from morphgen.errors import PartError
+from morphgen.formats import description
 from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.xacro.expand import Expansion
-from morphgen.grammar import part as module
 from morphgen.grammar.library import default_library
 from morphgen.grammar.manifest import read_manifest
 from morphgen.grammar.part import load_part
@@ -36,7 +36,7 @@ def real(tmp_path, monkeypatch):
     def make(**changes):
         urdf = tmp_path / "pincer.urdf"
         urdf.write_bytes(Expansion({}, urdf, PackageFinder()).run(PINCER.encode()))
-        monkeypatch.setattr(module, "distribution_file", lambda package, file: tmp_path / file)
+        monkeypatch.setattr(description, "distribution_file", lambda package, file: tmp_path / file)
         source = {"source": {"package": "rtb-data", "file": "pincer.urdf"}}
         tool = {"link": "palm", "xyz": [0, 0, 0.25]}
         manifest = write_part(tmp_path, **GONE | source | {"tool": tool} | changes)
