@@ -23,6 +23,7 @@ from morphgen.checks.robot_srdf import (
 )
 from morphgen.errors import FormatError, nearest
 from morphgen.extras import explain_missing_extras
+from morphgen.files import write_atomic
 from morphgen.fitting.replace_collision import SPHERES, as_spheres, link_spheres
 from morphgen.formats.bundle import (
     MESHES,
@@ -33,7 +34,7 @@ from morphgen.formats.bundle import (
     write_fits,
     write_meshes,
 )
-from morphgen.formats.files import write_atomic, writing_export
+from morphgen.formats.files import writing_export
 from morphgen.formats.glb import glb_bytes
 from morphgen.formats.mjcf.write import mjcf_text
 from morphgen.formats.ros_package import ros_package_name, write_ros_package
