@@ -233,6 +233,7 @@ class Learner:
         self._run_actor = ready(self.actor)
         self._run_critic = ready(self.target_critic if config.slow_critic else self.critic)
         self._run_losses = ready(self._actor_loss), ready(self._critic_loss)
+        self._run_loss = ready(self._loss)
 
         # The rollout, (T, n, ...). What the networks read and write is on the learner's device.
         obs, T, n = self._network_input(observation), config.num_steps, batch.num_envs
@@ -479,14 +480,23 @@ class Learner:
         def add(loss_of: LossOf) -> torch.Tensor:
             loss, metrics = loss_of(obs, minibatch, weights)
             loss.backward()  # type: ignore[no-untyped-call]
-            return metrics.clone()  # the next call of a CUDA graph overwrites its output
+            return metrics
 
+        if not is_host(self.device):  # a second CUDA graph would overwrite the first one's results
+            return add(self._run_loss)
         of_actor, of_critic = self._run_losses
-        if not is_host(self.device):
-            return torch.cat([add(of_actor), add(of_critic)])
         # The networks share nothing, and torch computes without Python's lock.
         critic = self._helper.submit(add, of_critic)
         return torch.cat([add(of_actor), critic.result()])
+
+    def _loss(
+        self, obs: Observation, minibatch: Mapping[str, torch.Tensor], weights: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the sum of both losses, shape (), and the metrics of both, shape (5,)."""
+        (actor, of_actor), (critic, of_critic) = (
+            loss_of(obs, minibatch, weights) for loss_of in (self._actor_loss, self._critic_loss)
+        )
+        return actor + critic, torch.cat([of_actor, of_critic])
 
     def _actor_loss(
         self, obs: Observation, minibatch: Mapping[str, torch.Tensor], weights: torch.Tensor

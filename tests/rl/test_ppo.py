@@ -390,3 +390,18 @@ def test_the_first_episodes_are_spread():
     batch = OnALine(8)
     learner(batch)
     assert batch.spread
+
+
+def test_the_loss_of_a_gpu_has_the_gradients_of_actor_and_critic():
+    trainer, seen = learner(epochs=1, minibatches=1, task_reweighting=True), []
+    of_actor, of_critic = trainer._run_losses
+    trainer._run_losses = lambda *data: seen.append(data) or of_actor(*data), of_critic
+    trainer.iterate()
+    parameters = [*trainer.actor.parameters(), *trainer.critic.parameters()]
+    whole, metrics = trainer._loss(*seen[0])
+    apart = [loss_of(*seen[0]) for loss_of in (of_actor, of_critic)]
+    assert metrics.equal(torch.cat([own for _, own in apart]))
+    gradients = torch.autograd.grad(whole, parameters)
+    others = torch.autograd.grad(apart[0][0], [*trainer.actor.parameters()])
+    others += torch.autograd.grad(apart[1][0], [*trainer.critic.parameters()])
+    assert all(map(torch.equal, gradients, others))
