@@ -17,6 +17,7 @@ import scipy  # loads its packages at their first use, which take seconds
 from msgspec import Meta
 from numpy.typing import ArrayLike, NDArray
 
+from morphgen.arguments import path_argument
 from morphgen.errors import BenchmarkError, TaskError, nearest
 from morphgen.formats.files import require_writable_file, write_file
 from morphgen.formats.records import FiniteNumber, Record
@@ -293,32 +294,6 @@ HEADERS = ("robot", "side", "task", "mode", "score", "95%", "success", "raw", "r
 UNSTABLE = "episodes that ended because their simulation became unstable"
 SUFFIXES = (".csv", ".json", ".md")
 
-Scores = Mapping[str, Sequence[Score]]  # scores by mode, or by the name of a baseline
-
-
-def score_table(scores_by_mode: Scores, style: str = "simple") -> str:
-    """Return a table with a line per robot and mode; ``style`` is one of tabulate's."""
-    rows = [_row(mode, each) for mode, scores in scores_by_mode.items() for each in scores]
-    return table(rows, HEADERS, style=style)
-
-
-def summary(scores_by_mode: Scores) -> str:
-    """Return a line per mode: mean scores of each side and task, and diverged episodes."""
-    lines = []
-    for mode, scores in scores_by_mode.items():
-        groups = dict.fromkeys((each.side, each.task) for each in scores)
-        means = []
-        for side, task in groups:
-            own = [each for each in scores if (each.side, each.task) == (side, task)]
-            score = np.mean([each.score for each in own])
-            success = success_of(own).as_percent()
-            means.append(f"{SIDES[side]} {task} {score:.2f}, success {success}")
-        unstable = sum(each.unstable for each in scores)
-        if unstable:
-            means.append(f"{UNSTABLE}: {unstable}")
-        lines.append(f"{mode}: " + "; ".join(means))
-    return "\n".join(lines)
-
 
 def require_table(path: Path) -> None:
     """Require that a table can be written to a path."""
@@ -329,41 +304,56 @@ def require_table(path: Path) -> None:
     require_writable_file(path)
 
 
-def write_scores(path: Path, scores_by_mode: Scores) -> None:
-    """Write CSV, JSON or Markdown, by the suffix of the path."""
-    require_table(path)
-    data = {mode: scores_to_json(scores) for mode, scores in scores_by_mode.items()}
-    if path.suffix == ".json":
-        write_file(path, json.dumps(data, indent=2) + "\n")
-    elif path.suffix == ".md":
-        write_file(path, score_table(scores_by_mode, "github") + "\n")
-    else:
-        text = io.StringIO()
-        writer = csv.DictWriter(text, ["mode", *SCORE_KEYS], lineterminator="\n")
-        writer.writeheader()
-        for mode, rows in data.items():
-            writer.writerows({"mode": mode, **row} for row in rows)
-        write_file(path, text.getvalue())
-
-
 @dataclass(frozen=True)
 class Evaluation:
     """Scores of a policy or a baseline, robot by robot; its text is a table."""
 
-    scores: Mapping[str, tuple[Score, ...]]
+    scores: Mapping[str, Sequence[Score]]
     """Scores by mode (``deterministic`` or ``stochastic``), or by the name of a baseline."""
 
     def as_dict(self) -> dict[str, list[dict[str, Any]]]:
         """Return the scores as JSON values, with null instead of nan."""
         return {mode: scores_to_json(scores) for mode, scores in self.scores.items()}
 
+    def table(self, style: str = "simple") -> str:
+        """Return a table with a line per robot and mode; ``style`` is one of tabulate's."""
+        rows = [_row(mode, each) for mode, scores in self.scores.items() for each in scores]
+        return table(rows, HEADERS, style=style)
+
+    def summary(self) -> str:
+        """Return a line per mode: mean scores of each side and task, and diverged episodes."""
+        lines = []
+        for mode, scores in self.scores.items():
+            means = []
+            for side, task in dict.fromkeys((each.side, each.task) for each in scores):
+                own = [each for each in scores if (each.side, each.task) == (side, task)]
+                score = np.mean([each.score for each in own])
+                success = success_of(own).as_percent()
+                means.append(f"{SIDES[side]} {task} {score:.2f}, success {success}")
+            if unstable := sum(each.unstable for each in scores):
+                means.append(f"{UNSTABLE}: {unstable}")
+            lines.append(f"{mode}: " + "; ".join(means))
+        return "\n".join(lines)
+
     def __str__(self) -> str:
-        """Return a line per robot and mode, then the means of each mode."""
-        return f"{score_table(self.scores)}\n{summary(self.scores)}"
+        """Return the table and the summary."""
+        return f"{self.table()}\n{self.summary()}"
 
     def write(self, path: str | PathLike[str]) -> None:
         """Write CSV, JSON or Markdown, by the suffix of the path."""
-        write_scores(Path(path), self.scores)
+        file = path_argument("path", path, TaskError)
+        require_table(file)
+        if file.suffix == ".json":
+            write_file(file, json.dumps(self.as_dict(), indent=2) + "\n")
+        elif file.suffix == ".md":
+            write_file(file, self.table("github") + "\n")
+        else:
+            text = io.StringIO()
+            writer = csv.DictWriter(text, ["mode", *SCORE_KEYS], lineterminator="\n")
+            writer.writeheader()
+            for mode, rows in self.as_dict().items():
+                writer.writerows({"mode": mode, **row} for row in rows)
+            write_file(file, text.getvalue())
 
 
 def _row(mode: str, score: Score) -> tuple[str, ...]:

@@ -151,7 +151,7 @@ def evaluate(
         given.sim = sim or _rules_of(robots).simulator
         given.mode = mode or (None if is_baseline else "deterministic")
     scores = (_baseline_scores if is_baseline else _policy_scores)(given)
-    return Evaluation({name: tuple(each) for name, each in scores.items()})
+    return Evaluation(scores)
 
 
 @checked_signature

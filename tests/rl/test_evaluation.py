@@ -23,7 +23,7 @@ from morphgen.rl.evaluation import (
 from morphgen.rl.runs.checkpoint import read_checkpoint, write_checkpoint
 from morphgen.rl.runs.robot_source import other_side, robot_source, split_source
 from morphgen.rl.runs.training import checkpoint_files, subruns_of, train
-from morphgen.rl.scores import score_table, scores_to_json, summary, write_scores
+from morphgen.rl.scores import Evaluation, scores_to_json
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import SIMULATORS
 from morphgen.tasks.scenes.make import batch_from_specs
@@ -243,17 +243,17 @@ def test_score_tables_have_every_robot_and_mode(run, tmp_path):
     found = {
         mode: evaluate_run(run, "train", EVAL, mode) for mode in ("deterministic", "stochastic")
     }
-    lines = score_table(found).splitlines()
+    lines = Evaluation(found).table().splitlines()
     assert len(lines) == 2 + 4
-    assert "MT reach" in summary(found)
+    assert "MT reach" in Evaluation(found).summary()
     mean = np.mean([each.score for each in found["deterministic"]])
-    assert f"{mean:.2f}" in summary(found).splitlines()[0]
-    assert "unstable" not in summary(found)
+    assert f"{mean:.2f}" in Evaluation(found).summary().splitlines()[0]
+    assert "unstable" not in Evaluation(found).summary()
     lost = [replace(found["deterministic"][0], unstable=2), *found["deterministic"][1:]]
     last = "episodes that ended because their simulation became unstable: 2"
-    assert summary({"deterministic": lost}).endswith(last)
+    assert Evaluation({"deterministic": lost}).summary().endswith(last)
     for suffix in (".csv", ".json", ".md"):
-        write_scores(tmp_path / f"table{suffix}", found)
+        Evaluation(found).write(tmp_path / f"table{suffix}")
     stored = json.loads((tmp_path / "table.json").read_text())
     assert stored["stochastic"] == scores_to_json(found["stochastic"])
     rows = (tmp_path / "table.csv").read_text().splitlines()
@@ -261,4 +261,4 @@ def test_score_tables_have_every_robot_and_mode(run, tmp_path):
     assert len(rows) == 1 + 4
     assert (tmp_path / "table.md").read_text().startswith("| robot")
     with pytest.raises(TaskError, match=r"table\.txt"):
-        write_scores(tmp_path / "table.txt", found)
+        Evaluation(found).write(tmp_path / "table.txt")

@@ -31,7 +31,7 @@ from morphgen.rl.runs.checkpoint import (
 )
 from morphgen.rl.runs.robot_source import drawn_source, other_side, robot_source, source_from
 from morphgen.rl.runs.training import METRICS, ROBOTS, read_metrics, recording, state_of
-from morphgen.rl.scores import score_table, scores_to_json
+from morphgen.rl.scores import Evaluation, scores_to_json
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 
@@ -306,8 +306,8 @@ def test_scores_of_poses_have_the_angle():
     assert 0 < score.angle < config.tasks[0].near_angle
     (stored,) = scores_to_json([score])
     assert stored["angle"] == score.angle
-    assert f"{score.angle * 57.29578:.1f} deg" in score_table({"ik": [score]})
+    assert f"{score.angle * 57.29578:.1f} deg" in Evaluation({"ik": [score]}).table()
     (by_position,) = evaluate_baseline("ik", source, EVAL)
     assert isnan(by_position.angle)
-    assert "deg" not in score_table({"ik": [by_position]})
+    assert "deg" not in Evaluation({"ik": [by_position]}).table()
     assert scores_to_json([by_position])[0]["angle"] is None
