@@ -333,7 +333,7 @@ class _FullHelp(argparse._HelpAction):
 
     def __call__(self, parser: argparse.ArgumentParser, *args: Any, **options: Any) -> None:  # noqa: ANN401
         for action in parser._actions:
-            if action.dest == "set":
+            if action.dest == "constants":
                 try:
                     names = import_module("morphgen.rl.config").constants_text()
                 except ImportError as error:
