@@ -5,7 +5,7 @@ The width of the terminal is in a context variable, so that whoever makes a tabl
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 
@@ -52,26 +52,27 @@ def table(
 ) -> str:
     """Return a table, in a block of ``fitted`` with as many columns as its width holds.
 
-    Columns are left out from the right, after those of ``last``; a text is shortened where that
-    keeps its column. A line below names the columns that are left out. Tables of Markdown are
-    always whole.
+    Columns are left out from the right, after those of ``last``; texts are shortened to half of the
+    width, and further where that keeps a column. A line below names the columns that are left out.
+    Tables of Markdown are always whole.
 
     Args:
         rows: Cells, as many in each row as there are headers.
         headers: Titles of the columns; in style ``plain`` a row like the others, without padding.
         style: One of tabulate's.
         formats: Format of numbers, for all columns or for each; by default all cells are texts.
-        last: Titles of the columns that are left out first.
+        last: Titles of the columns that are left out first, in this order.
     """
     if formats is None or isinstance(formats, str):
         number_formats = [formats or "g"] * len(headers)
     else:
         number_formats = list(formats)
 
-    def text(columns: Sequence[int], cut: int = -1, room: int = 0) -> str:
+    def text(columns: Sequence[int], most: Mapping[int, int]) -> str:
         titles: list[str] = [headers[i] for i in columns]
         lines: list[Sequence[object]] = [
-            [shortened(str(row[i]), room) if i == cut else row[i] for i in columns] for row in rows
+            [shortened(str(row[i]), most[i]) if i in most else row[i] for i in columns]
+            for row in rows
         ]
         if style == "plain":
             lines, titles = [titles, *lines], []
@@ -84,19 +85,23 @@ def table(
         )
 
     everything = range(len(headers))
-    result = text(everything)
-    if style == "github" or fits(result):
+    result, width = text(everything, {}), _width.get()
+    if width is None or style == "github" or _width_of(result) <= width:
         return result
+    half = {i: width // 2 for i in everything if any(isinstance(row[i], str) for row in rows)}
     order = [i for i in everything if headers[i] not in last]
-    order += [i for i in everything if headers[i] in last]
-    kept = len(order) - 1
-    while kept and not fits(text(sorted(order[:kept]))):
+    for title in reversed(last):
+        order += [i for i in everything if headers[i] == title]
+    kept = len(order)
+    while kept and _width_of(text(sorted(order[:kept]), half)) > width:
         kept -= 1
     shown = sorted(order[:kept])
-    room = (_width.get() or 0) - (_width_of(text(shown)) + _GAP if shown else 0)
-    if not shown or room >= max(_LEAST_TEXT, len(headers[order[kept]]) + _GAP):
-        shown = sorted(order[: kept + 1])
-    result = text(shown, order[kept], room)
+    if kept < len(order):
+        cut = order[kept]
+        room = width - (_width_of(text(shown, half)) + _GAP if shown else 0)
+        if not shown or room >= max(_LEAST_TEXT, len(headers[cut]) + _GAP):
+            shown, half = sorted([*shown, cut]), {**half, cut: room}
+    result = text(shown, half)
     hidden = dict.fromkeys(headers[i] for i in everything if i not in shown)
     return f"{result}\n(--wide shows {', '.join(hidden)})" if hidden else result
 

@@ -32,18 +32,29 @@ def test_a_text_is_shortened_where_that_keeps_its_column():
 
 
 def test_less_important_columns_go_first():
-    with fitted(35):
+    with fitted(30):
         lines = table(ROWS, HEADERS, last=["dof", "source"]).splitlines()
     assert lines[0].split() == ["name", "summary"]
     assert lines[-1] == "(--wide shows dof, source)"
 
 
 def test_one_column_remains_and_markdown_is_whole():
-    with fitted(20):
+    with fitted(12):
         assert len(table(ROWS, HEADERS[::-1])) > 0
         lines = table([row[::-1] for row in ROWS], HEADERS[::-1]).splitlines()
-        assert lines[2] == "a long arm of six..."
+        assert lines[2] == "a l..."
         assert table(ROWS, HEADERS, style="github").count("|") == 4 * 5
+
+
+def test_long_texts_do_not_take_the_place_of_all_other_columns():
+    rows = [("a" * 100, "b" * 100, 1.0, 2.0)]
+    with fitted(80):
+        lines = table(rows, ("method", "words", "score", "success")).splitlines()
+    assert lines[2].split() == ["a" * 37 + "...", "b" * 35 + "..."]
+    assert lines[3] == "(--wide shows score, success)"
+    with fitted(80):
+        lines = table(rows, ("method", "words", "score", "success"), last=["words"]).splitlines()
+    assert lines[2].split() == ["a" * 37 + "...", "b" * 15 + "...", "1.0", "2.0"]
 
 
 def test_titles_of_plain_tables_are_a_row():

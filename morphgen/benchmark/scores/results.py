@@ -500,7 +500,7 @@ def rows_data(rows: Sequence[ResultRow]) -> list[Any]:
     return [finite_or_none(asdict(row)) for row in rows]
 
 
-_LESS = ("trained", "fine-tuned", *(f"{name} IQM" for name in SIDE_NAMES.values()))
+_LESS = ("ZS IQM", "MT IQM", "fine-tuned", "trained", "MT success", "MT mean")
 """Columns of result tables that a narrow terminal leaves out first."""
 
 
@@ -517,7 +517,7 @@ def result_tables(rows: Sequence[ResultRow], style: str = "simple") -> str:
         decimals = score_decimals(side.mean for row in own for side in row.sides.values())
         lines = [_line(row, decimals) for row in own]
         title = split if split.endswith(f"/{task}") else f"{split}: {task}"
-        text = table(lines, headers, style=style, last=[*_LESS, reference])
+        text = table(lines, headers, style=style, last=[reference, *_LESS])
         parts.append(f"{'## ' * (style == 'github')}{title}\n\n{text}\n")
     return "\n".join(parts)
 
