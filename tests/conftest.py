@@ -10,6 +10,14 @@ from hypothesis import HealthCheck, settings
 # Tests do not fail because other work makes the machine slow.
 settings.register_profile("any load", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any load")
+gc.disable()  # else a third of the time in which tests are collected, and nothing is garbage
+
+
+def pytest_collection_finish():
+    """Collect the garbage of tests, but less often than Python does, which takes 5% of the time."""
+    gc.freeze()
+    gc.set_threshold(10_000)
+    gc.enable()
 
 
 @pytest.fixture(scope="module")
