@@ -1,6 +1,7 @@
 """Import order, module size and import cost of the packages."""
 
 import ast
+import json
 import os
 import subprocess
 import sys
@@ -208,17 +209,10 @@ def test_pybullet_processes_load_few_packages():
     assert loaded.isdisjoint({*SIMULATORS_AND_MESHES, "scipy", "lxml"} - {"pybullet"})
 
 
-@pytest.mark.parametrize(
-    "module",
-    [
-        "benchmark.split_folder",
-        "fitting.token_shapes",
-        "model.kinematics",
-        "tasks.scenes.env_specs",
-    ],
-)
-def test_splits_and_goals_do_not_import_torch(module):
-    assert "torch" not in modules_after(f"import morphgen.{module}")
+def test_splits_and_goals_do_not_import_torch():
+    names = "benchmark.split_folder fitting.token_shapes model.kinematics tasks.scenes.env_specs"
+    modules = [f"morphgen.{name}" for name in names.split()]
+    assert "torch" not in modules_after(f"import {', '.join(modules)}")
 
 
 WITHOUT_EXTRAS = """
@@ -272,44 +266,46 @@ def test_core_works_without_optional_extras(words, tmp_path):
     assert (done.returncode, done.stderr) == (0, "")
 
 
-@pytest.mark.parametrize(
-    ("words", "extra"),
-    [
-        (("fit", "ur5"), "fit"),
-        (("compose", "arm=ur5", "--geometry", "convex"), "convex"),
-        (("export", "prims", "--format", "usd"), "usd"),
-        (("train", "interpolation/arm3/reach"), "rl"),
-        (("finetune", "zero-shot"), "rl"),
-        (("play", "reach", "prims"), "tasks"),
-        (("speed", "reach", "prims"), "tasks"),
-        (("view",), "viewer"),
-    ],
-)
-def test_missing_extra_error_says_how_to_install_it(words, extra, tmp_path):
-    done = run_without_extras(tmp_path, *words)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert f"pip install 'morphgen[{extra}]'" in done.stderr
-    assert done.stderr.count("\n") == 1
+MISSING = {
+    "fit ur5": "fit",
+    "compose arm=ur5 --geometry convex": "convex",
+    "export prims --format usd": "usd",
+    "train interpolation/arm3/reach": "rl",
+    "finetune zero-shot": "rl",
+    "play reach prims": "tasks",
+    "speed reach prims": "tasks",
+    "view": "viewer",
+    'fit("z1")': "fit",
+    'make_env("reach", "prims")': "tasks",
+    'train("prims task=reach")': "rl",
+}
+"""Extra that a command, or a call of ``import morphgen``, needs."""
+TRIED_WITHOUT = """
+import contextlib, io, json, morphgen
+from morphgen.cli import main
 
-
-@pytest.mark.parametrize(
-    ("call", "extra"),
-    [
-        ('fit("z1")', "fit"),
-        ('make_env("reach", "prims")', "tasks"),
-        ('train("prims task=reach")', "rl"),
-    ],
-)
-def test_missing_extra_is_the_same_error_in_python(call, extra, tmp_path):
-    statements = f"""
-import morphgen
 assert all(getattr(morphgen, name) for name in dir(morphgen))
-try:
-    morphgen.{call}
-except morphgen.MorphgenError as error:
-    print(type(error).__name__, error)
+results = []
+for each in {calls}:
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = eval(f"morphgen.{{each}}") if "(" in each else main(each.split())
+        except morphgen.MorphgenError as error:
+            code = f"{{type(error).__name__}} {{error}}"
+    results.append((code, out.getvalue(), err.getvalue()))
+print(json.dumps(results))
 """
-    done = python_without_extras(tmp_path, statements)
+
+
+def test_missing_extra_error_says_how_to_install_it(tmp_path):
+    done = python_without_extras(tmp_path, TRIED_WITHOUT.format(calls=[*MISSING]))
     assert done.stderr == ""
-    assert done.stdout.startswith("MissingDependencyError the package ")
-    assert f"pip install 'morphgen[{extra}]'" in done.stdout
+    results = json.loads(done.stdout)
+    for (call, extra), (code, out, err) in zip(MISSING.items(), results, strict=True):
+        assert out == "", call
+        if "(" in call:
+            assert (code.startswith("MissingDependencyError the package "), err) == (True, ""), call
+        else:
+            assert (code, err.count("\n")) == (2, 1), call
+        assert f"pip install 'morphgen[{extra}]'" in f"{code} {err}", call

@@ -155,6 +155,7 @@ def test_a_dropped_mesh_is_removed_from_visuals_and_collisions():
         ({"values": {"length": 2.0}}, "pincer.length=2: out of range; expected 0.1 to 0.5 m"),
     ],
 )
+@pytest.mark.usefixtures("xacro_here")
 def test_a_manifest_that_contradicts_its_source_is_an_error(tmp_path, changes, message):
     with pytest.raises(PartError, match=r"^[^\n]*$") as caught:
         template(tmp_path, **changes)

@@ -17,10 +17,10 @@ from morphgen.tasks.reach.envs import ReachEnvs
 ROUNDING = 1e-5
 """Largest difference of numbers of order one; codes of joint positions have angles up to 200 rad,
 which are exact to 1e-5."""
-STEPS = 40
+STEPS = 20
 ROBOTS = {"reach": "arm=panda ee=panda_hand", "push": "prims"}
 CONFIGS = {
-    "reach": ReachConfig(max_episode_steps=STEPS, num_goals=5, near=0.5),
+    "reach": ReachConfig(max_episode_steps=STEPS, num_goals=5, near=0.7),
     "push": PushConfig(max_episode_steps=STEPS, num_goals=5, line=-0.1),
 }
 CHANNELS = ObservationConfig(
