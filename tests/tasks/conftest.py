@@ -2,11 +2,28 @@
 
 from contextlib import ExitStack, closing
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from helpers.caching import once
 from helpers.robots import arm
 from morphgen.checks.self_collision import survey_collisions
+from morphgen.tasks.scenes.env_specs import load_robot
+
+
+@pytest.fixture(scope="session", autouse=True)
+def named_once():
+    """Load a robot that words name for a batch once: composing takes a third of making most."""
+    named = once(load_robot, lambda words, library=(): (words, *library))
+
+    def load(source, library=()):
+        is_named = isinstance(source, str) and not Path(source).exists()
+        return (named if is_named else load_robot)(source, library=library)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("morphgen.tasks.scenes.make.load_robot", load)
+        yield
 
 
 @pytest.fixture
