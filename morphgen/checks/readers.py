@@ -302,6 +302,9 @@ def load_model(path: Path) -> mujoco.MjModel:
         return mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise FormatError(f"MuJoCo: {one_line(str(error))}") from error
+    finally:
+        # MuJoCo keeps up to 500 MB of meshes by their paths: here those of a copy, read once.
+        mujoco.mj_clearCache(mujoco.mj_getCache())
 
 
 def read_mujoco(file: str, folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:

@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 from importlib.util import find_spec
 
+import mujoco
 import pytest
 import trimesh
 
@@ -15,7 +16,7 @@ from morphgen.errors import FormatError
 from morphgen.formats.bundle import write_bundle
 from morphgen.formats.resolve import default_finder
 from morphgen.formats.urdf import read as urdf
-from morphgen.model.geometry import Capsule, Pose, Shape
+from morphgen.model.geometry import Capsule, Mesh, Pose, Shape
 from morphgen.model.robot import Frame, Inertial, Joint, Link, Mimic, Robot
 from morphgen.model.tree import rename
 
@@ -147,6 +148,14 @@ def test_a_missing_loader_is_reported(tmp_path, monkeypatch):
     row = next(row for row in report.rows if row.loader == "pinocchio")
     assert (row.passed, row.message) == (None, "not installed")
     assert report.passed
+
+
+def test_mujoco_keeps_no_meshes_of_the_copies_that_it_read(tmp_path):
+    mesh = tmp_path / "cube.stl"
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(mesh)
+    robot = with_link(arm(), "upper", visuals=(Shape(Mesh(mesh)),), collisions=())
+    assert conformance(bundle(robot, tmp_path), samples=2).passed
+    assert mujoco.mj_getCacheSize(mujoco.mj_getCache()) == 0
 
 
 def test_a_folder_that_is_not_a_bundle_is_an_error(tmp_path):
