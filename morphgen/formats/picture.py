@@ -51,6 +51,7 @@ def render(
     q = np.asarray(robot.home if q is None else q, dtype=np.float64)
     target, distance = _framing(robot, q, size[0] / size[1])
     model = mujoco.MjModel.from_xml_path(str(mjcf))
+    mujoco.mj_clearCache(mujoco.mj_getCache())  # up to 500 MB of meshes by paths, mostly new ones
     data = mujoco.MjData(model)
     for k, position in zip(robot.movable_joints, movable_positions(robot, q), strict=True):
         data.qpos[model.joint(robot.joints[k].name).qposadr[0]] = position
