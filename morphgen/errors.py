@@ -60,6 +60,10 @@ class TaskError(MorphgenError):
     """A task cannot be set up for a robot, or an action is invalid."""
 
 
+class NoGoalsError(TaskError):
+    """A robot cannot do a task, or hardly: its seed and constants give too few goals."""
+
+
 class SimulationError(MorphgenError):
     """A simulator cannot load a scene, or ended."""
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from platformdirs import user_cache_path
 
 from morphgen.encoding.robot_hash import robot_hash
-from morphgen.errors import BenchmarkError, TaskError
+from morphgen.errors import BenchmarkError, NoGoalsError, TaskError
 from morphgen.files import write_cache_file
 from morphgen.formats.zip_files import read_npz
 from morphgen.model.geometry import Pose
@@ -34,6 +34,7 @@ from morphgen.tasks.task import GoalSet, Task, TaskConfig, require_returned
 FOLDER = Path(__file__).parents[1] / "goal_set_files"
 """Folder of the compressed sets and of their index."""
 INDEX = "index.json"
+MAX_REFUSAL = 2000  # characters that are read of why a robot has no goals
 
 
 @cache
@@ -94,26 +95,39 @@ def goal_set(
 
     kind: type[GoalSet] = task.goal_set_type
     folder = user_cache_path("morphgen") / task.cache_folder if cache is None else Path(cache)
-    path = folder / f"{key}.npz"
+    path, refusal = folder / f"{key}.npz", folder / f"{key}.txt"
     if not anew:
         if (content := packaged_set(key)) is not None:
             return replace(set_from_npz(content, kind), robot=robot.name)
         if path.is_file():
             return replace(_read_cached(path, kind), robot=robot.name)
+        if refusal.is_file():
+            with refusal.open(encoding="utf-8") as file:
+                raise NoGoalsError(f"robot {robot.name!r} {file.read(MAX_REFUSAL)}")
     seeds = np.random.SeedSequence(
         [seed, int(robot_hash(robot, visuals=False), 16), int(obstacles)]
     )
     identity = {"robot": robot.name, "key": key, "seed": seed}
-    goals: GoalSet = task.sample(
-        robot, config, obstacles=obstacles, ground=ground, seeds=seeds, identity=identity
-    )
-    require_returned(task.name, "sample", goals, isinstance(goals, kind), kind.__name__)
     try:
-        if not anew:
-            write_cache_file(path, set_npz(goals))
-    except OSError as error:
-        warnings.warn(f"cannot store a {kind.__name__} in {path}: {error.strerror}", stacklevel=2)
+        goals: GoalSet = task.sample(
+            robot, config, obstacles=obstacles, ground=ground, seeds=seeds, identity=identity
+        )
+    except NoGoalsError as error:
+        if not anew:  # to find none takes longer than to find some
+            _store(refusal, str(error).removeprefix(f"robot {robot.name!r} ").encode())
+        raise
+    require_returned(task.name, "sample", goals, isinstance(goals, kind), kind.__name__)
+    if not anew:
+        _store(path, set_npz(goals))
     return goals
+
+
+def _store(path: Path, content: bytes) -> None:
+    """Write a file of the cache, or warn that it cannot be written."""
+    try:
+        write_cache_file(path, content)
+    except OSError as error:
+        warnings.warn(f"cannot store goals in {path}: {error.strerror}", stacklevel=3)
 
 
 def goal_set_key(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.encoding.similarity import tool_reach
-from morphgen.errors import TaskError
+from morphgen.errors import NoGoalsError, TaskError
 from morphgen.formats.mjcf.write import MujocoKinematics
 from morphgen.model.kinematics import (
     forward_kinematics,
@@ -384,7 +384,7 @@ def draw_feasible(
     reasons = ", ".join(
         f"{reason} ({count / tried:.0%})" for reason, count in refusals.most_common()
     )
-    raise TaskError(
+    raise NoGoalsError(
         f"robot {robot.name!r} can hardly push: only {len(starts)} of {tried:,} poses of a block "
         f"of {region.edge:.3g} m with x in ({region.x[0]:.3g}, {region.x[1]:.3g}) and y in "
         f"({region.y[0]:.3g}, {region.y[1]:.3g}) are feasible (acceptance rate "

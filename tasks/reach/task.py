@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.encoding.similarity import shoulder
-from morphgen.errors import TaskError
+from morphgen.errors import NoGoalsError
 from morphgen.formats.mjcf.write import MujocoKinematics
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
@@ -135,7 +135,7 @@ class Reach(Task[ReachConfig, ReachGoalSet]):
         poses = _pose_rows(frame_pose(robot, q, TOOL))
         moved = float(np.linalg.norm(poses[:, :3] - poses[0, :3], axis=1).max())
         if moved <= config.near and len(poses) > 1:
-            raise TaskError(
+            raise NoGoalsError(
                 f"robot {robot.name!r} cannot reach: over {len(poses)} configurations its tool "
                 f"moves {moved:.2g} m, and a goal is reached within {config.near:g} m; place the "
                 f"frame {TOOL!r} at the working point"

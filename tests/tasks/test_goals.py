@@ -9,7 +9,7 @@ import pytest
 from helpers.goal_sets import CONFIG, LIFTED, draw_goals, sample_goals
 from helpers.scenes import robot
 from morphgen.encoding.similarity import shoulder, workspace
-from morphgen.errors import BenchmarkError, TaskError
+from morphgen.errors import BenchmarkError, NoGoalsError, TaskError
 from morphgen.model.geometry import IDENTITY, Box, Pose, Shape
 from morphgen.model.kinematics import frame_pose, joint_limits
 from morphgen.model.robot import Frame, Joint, Link, Robot
@@ -232,7 +232,7 @@ def test_unwritable_cache_is_a_warning(body, tmp_path, monkeypatch):
     monkeypatch.setattr(goal_sets, "user_cache_path", lambda name: tmp_path / name)
     assert (tmp_path / "morphgen" / "goals-5" / f"{sample_goals(body, None).key}.npz").is_file()
     (tmp_path / "file").write_text("in the way")
-    with pytest.warns(UserWarning, match="cannot store a ReachGoalSet"):
+    with pytest.warns(UserWarning, match="cannot store goals in"):
         goal_set = sample_goals(body, tmp_path / "file" / "goals")
     assert len(goal_set.q) == 12
 
@@ -435,7 +435,13 @@ def test_robot_that_cannot_push_is_rejected_with_the_reason(tmp_path, monkeypatc
         push_region(robot(ARMS[0]), PUSH, -3.0, np.random.default_rng(0))
     with pytest.raises(TaskError, match="its tool is never as low as a block"):
         push_region(robot("nlink"), PUSH, -0.5, np.random.default_rng(0))
-    assert not cache.exists()
+    (stored,) = cache.iterdir()
+    assert stored.suffix == ".txt"
+    monkeypatch.setattr(starts, "draw_feasible", None)  # nothing is tested again
+    other = replace(robot("prims"), name="other")
+    with pytest.raises(NoGoalsError) as again:
+        draw_goals(other, replace(PUSH, start=-0.9), ground=0.0, cache=cache)
+    assert str(again.value) == str(caught.value).replace("'prims'", "'other'")
 
 
 def test_obstacles_that_block_every_push_are_an_error(tmp_path, monkeypatch):
