@@ -50,7 +50,7 @@ from morphgen.benchmark.scores.submission import (
 from morphgen.benchmark.split_folder import SPLIT_FILE, BuildSettings, is_archive, require_unchanged
 from morphgen.benchmark.survey import BaselineResults
 from morphgen.cli import options as opt
-from morphgen.cli.progress import bar
+from morphgen.cli.progress import bar, status
 from morphgen.errors import BenchmarkError
 from morphgen.formats.files import require_writable_folder
 from morphgen.splits.split import Split
@@ -66,7 +66,8 @@ def release(args: argparse.Namespace) -> None:
     extra: dict[str, bytes] = {}
     results: BaselineResults = {}
     if args.scores:
-        references = collect_references(args.scores, split, protocol, library, jobs=args.jobs)
+        with bar(args, "checking the scores"):
+            references = collect_references(args.scores, split, protocol, library, jobs=args.jobs)
         extra, results = reference_files(references), references.results()
     request = ReleaseRequest(
         version=args.release_version,
@@ -161,7 +162,8 @@ def score(args: argparse.Namespace) -> None:
             f"edited random_score changes a score of {' and '.join(relative)}; rank submissions in "
             "a release that has one (split release --scores)"
         )
-    rows = [score_submission(each, random) for each in submissions] + references.rows()
+    with status(args, "scoring"):
+        rows = [score_submission(each, random) for each in submissions] + references.rows()
     data = {
         "split": split.name,
         "random": "release" if random else "submission",
@@ -213,7 +215,8 @@ MODES = ("deterministic", "stochastic", "all")
 
 def tables(args: argparse.Namespace) -> None:
     """Print a table for every split and task."""
-    submissions = read_submissions(args.files)
+    with status(args, "reading the episodes"):
+        submissions = read_submissions(args.files)
     modes = {"", args.mode} if args.mode != "all" else {each.mode for each in submissions.values()}
     found = {where: each for where, each in submissions.items() if each.mode in modes}
     if not found:
@@ -221,6 +224,7 @@ def tables(args: argparse.Namespace) -> None:
             f"--mode {args.mode}: none of the {len(submissions)} submissions acts so; expected "
             f"--mode {' or '.join(mode for mode in MODES if mode != args.mode)}"
         )
-    rows = result_rows(found)
+    with status(args, "scoring"):
+        rows = result_rows(found)
     style = "github" if args.markdown else "simple"
     opt.print_result(args, rows_data(rows), lambda: f"{result_tables(rows, style)}\n{NOTE}")

@@ -34,7 +34,7 @@ from morphgen.benchmark.scores.study import (
     write_tables,
 )
 from morphgen.cli import options as opt
-from morphgen.cli.progress import note, training_progress
+from morphgen.cli.progress import note, status, training_progress
 from morphgen.errors import TaskError, nearest
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import (
@@ -172,7 +172,8 @@ def study(args: argparse.Namespace) -> int:
     require_cells(cells)
     args.out.mkdir(parents=True, exist_ok=True)
     failures = 0 if args.report else _run_cells(args, cells, execution)
-    written = write_tables(args.out, cells)
+    with status(args, "scoring"):
+        written = write_tables(args.out, cells)
     print((args.out / TABLE).read_text(encoding="utf-8"))
     for path in written:
         print(path)
