@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from morphgen.errors import MorphgenError
+from morphgen.errors import MorphgenError, SimulationError
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import split_colours
 from morphgen.grammar.grammar_file import SUFFIX
@@ -207,6 +207,8 @@ def start(key: str, config: RolloutConfig, files: FileAccess) -> EpisodeSource:
 
 def advance(key: str) -> tuple[bool, list[tuple[dict[str, Any], str]]]:
     """Simulate some steps; return whether a robot is running, and each robot's steps and fault."""
+    if key not in _rollouts:  # this process has replaced that of the start
+        raise SimulationError("the process that simulated this episode has died; start it again")
     rollout = _rollouts[key]
     before = [track.num_steps for track in rollout.episode.tracks]
     is_running = all([rollout.advance() for _ in range(STEPS_AHEAD)])

@@ -12,7 +12,7 @@ import pytest
 from helpers.robots import arm
 from helpers.runs import QUIET, small_config
 from helpers.viser_client import PlainClient
-from morphgen.errors import MorphgenError
+from morphgen.errors import MorphgenError, SimulationError
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.library import default_library
 from morphgen.model.kinematics import frame_pose
@@ -103,6 +103,8 @@ def test_a_rollout_of_the_process_of_simulations_is_the_same(episode, files, mod
     assert len(simulation._rollouts) == 1
     remote.close()
     assert simulation._rollouts == {}
+    with pytest.raises(SimulationError, match="has died; start it again"):
+        simulation.advance(remote._key)
 
 
 def test_score_counts_the_steps_so_far(episode):
