@@ -14,7 +14,7 @@ EXTRAS = {
     "gymnasium": ("tasks", "rl"),
     "imageio": ("tasks", "rl"),
     "tensorboard": ("rl",),
-    "torch": ("tasks", "rl", "fit"),
+    "torch": ("tasks", "rl"),
     "urdf_usd_converter": ("usd",),
     "viser": ("viewer",),
     "websockets": ("viewer",),

@@ -52,9 +52,9 @@ if TYPE_CHECKING:
 
 _LOGGER = logging.getLogger(__name__)
 SPHERES = 8  # default number of spheres per link
-_SPHERE_CACHE = "spheres-1"
-"""Folders in the cache begin so; the number rises when the same shapes get other spheres."""
-_CACHE = f"fits-{FITTER_VERSION}"  # folder of the fits in the user's cache
+_CACHE, _SPHERE_CACHE = "fits-3", "spheres-2"
+"""Folders in the user's cache, or their beginnings; the numbers rise when the same shapes get other
+primitives."""
 Geometry = Literal["mesh", "primitive", "convex", "sphere"]
 """Collision shapes of a robot. ``mesh``: those of its parts, with meshes whose hulls simulators
 collide. In place of meshes, ``primitive``: fitted boxes, cylinders and spheres; ``convex``: convex
@@ -74,15 +74,15 @@ def as_primitives(robot: Robot, folders: Sequence[Path]) -> Robot:
     """Return the robot as tasks use it: fitted collision primitives, numbers rounded as in a file.
 
     Fits that the robot carries or that the folders store are used. Other links with meshes are
-    fitted once, which takes seconds per link and is logged, and their fits are cached. The result
-    carries the token primitive of each link. A robot, its bundle (with meshes or primitives) and
-    the result of this function all give the same result.
+    fitted once, which is logged, and their fits are cached. The result carries the token primitive
+    of each link. A robot, its bundle (with meshes or primitives) and the result of this function
+    all give the same result.
     """
     fits = _known_fits(robot, read_stored_fits(folders))
     if missing := _meshed_links(robot, fits):
         fits |= _cached_fits(missing, _CACHE)
     if missing := _meshed_links(robot, fits):
-        from morphgen.fitting.robot_fit import COLLISION_OPTIONS  # imports torch, which takes long
+        from morphgen.fitting.robot_fit import COLLISION_OPTIONS  # needs the extra fit
 
         fits |= _fit_and_keep(robot, missing, COLLISION_OPTIONS, _CACHE, {})
     return _with_provenance(robot, fits, {"fitter": FITTER_VERSION})
@@ -99,11 +99,11 @@ def as_spheres(
     """Return the robot with spheres as its collision shapes.
 
     A link whose collision shapes are spheres already keeps them. The spheres of the others come
-    from the user's cache or from a new fit, about two seconds per link, which is then cached.
+    from the user's cache or from a new fit, which is then cached.
     Masses, inertias and visuals stay; the pairs of links whose contacts are ignored are determined
     again.
     """
-    from morphgen.fitting.link_fit import FitOptions  # imports torch, which takes seconds
+    from morphgen.fitting.link_fit import FitOptions  # needs the extra fit
 
     options = FitOptions(spheres=spheres, cover=cover)
     stored = read_stored_fits(folders)
@@ -177,10 +177,10 @@ def _fit_and_keep(
     jobs: int = 1,
 ) -> dict[str, StoredFit]:
     """Fit links with collision shapes, say so, keep the fits in the cache, and return them."""
-    from morphgen.fitting.robot_fit import fit_links, fits_of  # imports torch, which takes long
+    from morphgen.fitting.robot_fit import fit_links, fits_of  # needs the extra fit
 
     _LOGGER.warning(
-        "fitting primitives to %d links of robot %r, seconds for each; the fits are kept",
+        "fitting primitives to %d links of robot %r; the fits are kept",
         len(links),
         robot.name,
     )

@@ -132,8 +132,7 @@ def fit_links(
         else:
             primitives = tuple(moved(shape, T_link_first) for shape in fit.primitives)
             single = fit.single and moved(fit.single, T_link_first)
-            measured = quality(solids[link.name], primitives)
-            copy = replace(fit, primitives=primitives, single=single, quality=measured, seconds=0.0)
+            copy = replace(fit, primitives=primitives, single=single, seconds=0.0)
             reports.append(LinkReport(link.name, copy, solid_links[first].name))
     findings = []
     for link in links:
@@ -219,6 +218,10 @@ def _with_token(link: str, shapes: Sequence[Shape], fit: LinkFit) -> StoredFit:
     if single is None and are_primitives(shapes):
         single = token_of_primitives(shapes)
     if single is None:
-        (single,) = fit_shapes(shapes, TOKEN_OPTIONS, solid=solid).primitives
-    token_iou = quality(solid, [single]).iou
+        fitted = fit_shapes(shapes, TOKEN_OPTIONS, solid=solid)
+        (single,), token_iou = fitted.primitives, fitted.quality.iou
+    elif fit.primitives == (single,):
+        token_iou = fit.quality.iou
+    else:
+        token_iou = quality(solid, [single]).iou
     return StoredFit(link, single, fit.primitives, token_iou, fit.quality.iou)

@@ -1,11 +1,14 @@
 """Search for the primitives of largest intersection over union (IoU) with a solid.
 
-Initial guesses are improved by gradient ascent on a soft IoU; counted sample points decide.
+Initial guesses are improved by gradient ascent on a soft IoU, in rounds: the best go on with more
+sample points. Counted points decide.
 
 The membership of a point in a primitive is ``sigmoid(-distance / tau)``, so that the ratio of
 volumes has a gradient; ``tau`` decreases during the ascent. The membership in a union is
-``1 - prod(1 - membership)``, so overlaps count once. Many candidates, of one or several primitives
-each, are optimised at once.
+``1 - prod(1 - membership)``, so overlaps count once. The distance is the largest of those beyond
+the faces of a primitive. Many candidates, of one or several primitives each, are improved at once,
+in NumPy: arrays are too small for the threads of a tensor library, whose import takes longer than
+the fit of a link.
 """
 
 from __future__ import annotations
@@ -15,7 +18,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import torch
 import trimesh
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
@@ -27,7 +29,6 @@ from morphgen.fitting.canonical import KINDS, canonical
 from morphgen.fitting.solid import Solid
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
 from morphgen.model.rotation import IDENTITY, normalize
-from morphgen.processes import one_torch_thread
 from morphgen.typing import Array
 
 TRIM = 0.03  # share of a cloud's points outside of a guess at either end of an axis
@@ -48,21 +49,20 @@ NEAR_POINTS, FAR_POINTS = 2**14, 2**12
 NEAR, FAR = 0.02, 0.35
 """Margins of their boxes around the bounding box, relative to the solid's size."""
 NUM_CLUSTERINGS = 4  # number of clusterings from which the search for several primitives starts
-NUM_REFINED = 2  # number of candidates that are refined on all sample points
 DIGITS = 6  # decimals of dimensions and positions in metres; quaternions have three more
-NUM_SPHERE_CLUSTERINGS = 2
-"""Number of clusterings from which the search starts; more bring next to nothing."""
+NUM_SPHERE_CLUSTERINGS = 3
+"""Number of clusterings from which the search for spheres starts."""
 EMPHASES = (6.0, 20.0, 100.0)
 """Weights of points inside, relative to points outside, of fits that must cover the solid; tuned on
 the Panda and the UR5. The best one is larger the thinner the solid and the fewer the spheres."""
 RESERVE = 0.2
 """Share of the volume that may stay uncovered by which a fit covers more than it must, because the
 cover is counted on sample points."""
-_TAU = (0.02, 0.006)
-"""Softness of the membership in the first ascent of several [sizes of the solid]."""
 _MIN_RADIUS = 1e-3
 """Smallest radius of a guess and after a change of all radii [sizes of the solid]."""
-_MAX_DISTANCES = 96_000  # number of distances that are evaluated together; bounds memory
+_MAX_DISTANCES = 2**18  # number of distances that are evaluated together; bounds memory
+_MOMENTS = (0.8, 0.98)  # decay rates of Adam: a short memory, for less than 100 steps
+_SMALL = 1e-12  # smallest distance from an axis or a centre, where its gradient is not finite
 
 
 @dataclass(frozen=True)
@@ -101,139 +101,172 @@ class Candidates:
         return Candidates(*(np.concatenate(array, axis=axis) for array in arrays))
 
 
-def ascend(
-    candidates: Candidates,
-    cloud: Cloud,
-    *,
-    num_steps: int,
-    tau: tuple[float, float],
-    rate: tuple[float, float],
-) -> Candidates:
-    """Return the candidates after gradient ascent (Adam) on the soft IoU.
+@dataclass(frozen=True)
+class Round:
+    """One round of a search, in which the best candidates of the round before are improved."""
 
-    tau: Softness of the membership in the first and last step.
-    rate: Learning rate in the first and last step.
-    """
-    kinds = torch.from_numpy(candidates.kinds)
-    x, target, weight = (
-        torch.from_numpy(array.astype(np.float32))
-        for array in (cloud.points, cloud.inside, cloud.weights)
-    )
-    parameters = [
-        torch.from_numpy(start.astype(np.float32)).requires_grad_()
-        for start in (candidates.centres, candidates.quaternions, np.log(candidates.halves))
-    ]
-    centres, quaternions, logs = parameters
+    candidates: int | None  # number of candidates; None for all
+    points: int  # number of sample points
+    steps: int  # number of steps of the gradient ascent
+    tau: tuple[float, float]
+    """Softness of the membership in the first and last step [sizes of the solid]."""
+    rate: tuple[float, float]
+    """Learning rate in the first and last step [sizes of the solid]."""
+
+
+NUM_COUNTED = 2**13  # number of points that select candidates between rounds
+_SAME = 0.01  # difference of centres and half extents up to which candidates are alike
+ROUNDS = (
+    Round(None, COARSE_POINTS, 40, (0.03, 0.008), (0.01, 0.003)),
+    Round(2, NEAR_POINTS + FAR_POINTS, 60, (0.006, 0.0015), (0.004, 0.0004)),
+)
+
+
+def ascend(candidates: Candidates, cloud: Cloud, how: Round) -> Candidates:
+    """Return the candidates after gradient ascent (Adam) on the soft IoU of one round."""
+    n, k = candidates.kinds.shape
+    rows = max(_MAX_DISTANCES // (k * len(cloud.points)), 1)
+    if n > rows:
+        batches = (np.arange(start, min(start + rows, n)) for start in range(0, n, rows))
+        shared = cloud.weights.ndim == 1
+        return Candidates.stack(
+            [
+                ascend(
+                    candidates.take(batch),
+                    cloud if shared else replace(cloud, weights=cloud.weights[batch]),
+                    how,
+                )
+                for batch in batches
+            ]
+        )
+    kinds = candidates.kinds.reshape(-1)
+    rotations = Rotation.from_quat(candidates.quaternions.reshape(-1, 4), scalar_first=True)
+    centres = candidates.centres.reshape(-1, 3)
+    logs = np.log(candidates.halves.reshape(-1, 3))
+    x = _homogeneous(cloud.points)
+    weights = cloud.weights.astype(np.float32)
+    within, beyond = np.where(cloud.inside, weights, 0), np.where(cloud.inside, 0, weights)
+    volume = within.sum(axis=-1, dtype=np.float64)
     # One step of a rotation or of a logarithm moves the surface about as far as one of a centre.
-    size = float(np.exp(np.log(candidates.halves).mean()))
-    groups = [
-        {"params": [centres], "unit": 1.0},
-        {"params": [quaternions], "unit": 0.5 / size},
-        {"params": [logs], "unit": 1.0 / size},
-    ]
-    optimizer = torch.optim.Adam(groups, lr=rate[0], betas=(0.8, 0.98))  # short memory: 100 steps
-    for step in range(num_steps):
-        progress = step / max(num_steps - 1, 1)
-        softness = tau[0] * (tau[1] / tau[0]) ** progress
-        for group in optimizer.param_groups:
-            group["lr"] = group["unit"] * rate[0] * (rate[1] / rate[0]) ** progress
-        optimizer.zero_grad(set_to_none=True)
-        distance = _distance(x, kinds, centres, quaternions, logs.exp())
-        member = 1 - torch.exp(-torch.nn.functional.softplus(-distance / softness).sum(dim=1))
-        member, weighted_target = member * weight, (target * weight).expand_as(member)
-        intersection = (member * target).sum(dim=1)
-        union = member.sum(dim=1) + weighted_target.sum(dim=1) - intersection
-        loss = -(intersection / (union + 1e-9)).sum()  # a candidate may be far from all points
-        torch.autograd.backward(loss)
-        optimizer.step()
-    with torch.no_grad():
-        centres, quaternions, logs = (tensor.double() for tensor in parameters)
-        unit = quaternions / quaternions.norm(dim=-1, keepdim=True)
-    return Candidates(candidates.kinds, centres.numpy(), unit.numpy(), logs.exp().numpy())
+    unit = np.ones((n * k, 9))
+    unit[:, 3:] = np.exp(-logs.reshape(n, -1).mean(axis=1)).repeat(k)[:, None]
+    mean, square = np.zeros((2, n * k, 9))
+    for step in range(how.steps):
+        progress = step / max(how.steps - 1, 1)
+        tau, rate = (a * (b / a) ** progress for a, b in (how.tau, how.rate))
+        R, halves = rotations.as_matrix(), np.exp(logs)
+        local, extents, away = _beyond(x, kinds, R, centres, halves)
+        distance = away.max(axis=1)
+        with np.errstate(over="ignore"):  # far away the membership is zero
+            member = 1 / (1 + np.exp(distance * np.float32(1 / tau)))
+        member = member.reshape(n, k, -1)
+        spared = (1 - member).prod(axis=1)
+        held = 1 - spared
+        both = (held * within).sum(axis=1, dtype=np.float64)
+        either = volume + (held * beyond).sum(axis=1, dtype=np.float64)
+        # The slopes of the IoU along the membership, then along the distances of the primitives.
+        slope = _column(both / either**2 / tau) * beyond - _column(1 / either / tau) * within
+        member *= (slope * spared)[:, None]
+        by_face = (away == distance[:, None]) * member.reshape(n * k, 1, -1)
+        by_log = -by_face.sum(axis=2) * halves
+        local *= by_face
+        local /= extents
+        # Sums over the points of the slopes along local coordinates: times points, and alone.
+        moments = (local @ x.T).astype(np.float64)
+        times_points, pushed = moments[:, :, :3] @ R, moments[:, :, 3:]
+        by_centre = -(R @ pushed)[:, :, 0]
+        times_local = times_points - pushed * (centres[:, None] @ R)
+        by_angle = (times_local - times_local.transpose(0, 2, 1))[:, (1, 2, 0), (2, 0, 1)]
+        gradient = np.concatenate([by_centre, by_angle, by_log], axis=1)
+        mean += (1 - _MOMENTS[0]) * (gradient - mean)
+        square += (1 - _MOMENTS[1]) * (gradient**2 - square)
+        means, squares = (
+            moment / (1 - decay ** (step + 1))
+            for moment, decay in zip((mean, square), _MOMENTS, strict=True)
+        )
+        change = rate * unit * means / (np.sqrt(squares) + 1e-8)
+        centres = centres + change[:, :3]
+        rotations = rotations * Rotation.from_rotvec(change[:, 3:6])
+        logs = logs + change[:, 6:]
+    return Candidates(
+        candidates.kinds,
+        centres.reshape(n, k, 3),
+        rotations.as_quat(scalar_first=True).reshape(n, k, 4),
+        np.exp(logs).reshape(n, k, 3),
+    )
+
+
+def _column(values: Array) -> NDArray[np.float32]:
+    return values.astype(np.float32)[:, None]
 
 
 def overlaps(candidates: Candidates, cloud: Cloud) -> Array:
     """Return the IoU of each candidate by counting points, shape (n,)."""
-    target, weight = torch.from_numpy(cloud.inside), torch.from_numpy(cloud.weights)
-    n, k = candidates.kinds.shape
-    rows = max(_MAX_DISTANCES // (k * len(cloud.points)), 1)
-    ious = []
-    for start in range(0, n, rows):
-        batch = candidates.take(np.arange(start, min(start + rows, n)))
-        member = (_distances(batch, cloud.points) <= 0).any(dim=1)
-        both, either = (count.double() @ weight for count in (member & target, member | target))
-        ious.append(both / either.clamp(min=1e-12))
-    return np.asarray(torch.cat(ious).numpy())
+    held = covered(candidates, cloud.points)
+    both, outside = (
+        np.where(held & which, cloud.weights, 0.0).sum(axis=1)
+        for which in (cloud.inside, ~cloud.inside)
+    )
+    volume = (cloud.weights * cloud.inside).sum(axis=-1)
+    return np.asarray(both / np.maximum(volume + outside, 1e-12))
 
 
 def covered(candidates: Candidates, points: Array) -> NDArray[np.bool_]:
     """Return which points (m, 3) are inside any primitive of each candidate, shape (n, m)."""
-    return np.asarray((_distances(candidates, points) <= 0).any(dim=1).numpy())
+    return _distances(candidates, points) <= 0
 
 
-@torch.no_grad()
-def _distances(candidates: Candidates, points: Array) -> torch.Tensor:
-    """Return signed distances, shape (n, k, m), without gradients."""
-    arrays = (candidates.centres, candidates.quaternions, candidates.halves)
-    return _distance(
-        torch.from_numpy(points.astype(np.float32)),
-        torch.from_numpy(candidates.kinds),
-        *(torch.from_numpy(array.astype(np.float32)) for array in arrays),
-    )
+def _distances(candidates: Candidates, points: Array) -> NDArray[np.float32]:
+    """Return the distances of points (m, 3) from the nearest primitive of each candidate, (n, m).
+
+    They are negative inside.
+    """
+    n, k = candidates.kinds.shape
+    x = _homogeneous(points)
+    rotations = Rotation.from_quat(candidates.quaternions.reshape(-1, 4), scalar_first=True)
+    R = rotations.as_matrix().reshape(n, k, 3, 3)
+    block = max(_MAX_DISTANCES // k, 1)
+    distances = np.empty((n, len(points)), np.float32)
+    for row in range(n):
+        one = (candidates.kinds[row], R[row], candidates.centres[row], candidates.halves[row])
+        for start in range(0, len(points), block):
+            *_, away = _beyond(x[:, start : start + block], *one)
+            distances[row, start : start + block] = away.max(axis=1).min(axis=0)
+    return distances
 
 
-def _distance(
-    x: torch.Tensor,
-    kinds: torch.Tensor,
-    centres: torch.Tensor,
-    quaternions: torch.Tensor,
-    halves: torch.Tensor,
-) -> torch.Tensor:
-    """Return signed distances (n, k, m) of points (m, 3) to primitives (n, k)."""
-    n, k = kinds.shape
-    if bool((kinds == _SPHERE).all()):
-        # Spheres need no rotation of the points, which is most of the work.
-        from_centres = torch.cdist(centres.reshape(1, n * k, 3), x[None])
-        return from_centres.reshape(n, k, -1) - halves[:, :, :1]
-    # Primitives are sorted by kind, so that each kind is one block of tensor operations.
-    flat = kinds.reshape(-1)
-    order = torch.argsort(flat, stable=True)
-    local = _local(x, centres.reshape(-1, 3)[order], quaternions.reshape(-1, 4)[order])
-    size = halves.reshape(-1, 3)[order][:, :, None]
-    boxes, cylinders = (int((flat == KINDS.index(kind)).sum()) for kind in ("box", "cylinder"))
-    end = boxes + cylinders
-    distances = []
-    if boxes:
-        distances.append(_rounded(local[:boxes].abs() - size[:boxes]))
-    if cylinders:
-        points, half = local[boxes:end], size[boxes:end]
-        # The square root has no finite gradient at zero, on the axis.
-        radial = (points[:, :2].square().sum(dim=1) + 1e-12).sqrt() - half[:, 0]
-        axial = points[:, 2].abs() - half[:, 2]
-        distances.append(_rounded(torch.stack([radial, axial], dim=1)))
-    if end < len(flat):
-        distances.append((local[end:].square().sum(dim=1) + 1e-12).sqrt() - size[end:, 0])
-    return torch.cat(distances)[torch.argsort(order)].reshape(n, k, -1)
+def _homogeneous(points: Array) -> NDArray[np.float32]:
+    """Return points (m, 3) with a fourth coordinate of one, shape (4, m)."""
+    return np.concatenate([points.T, np.ones((1, len(points)))]).astype(np.float32)
 
 
-def _rounded(beyond: torch.Tensor) -> torch.Tensor:
-    """Return signed distances from the distances beyond each pair of faces, (p, faces, m)."""
-    outside = (beyond.clamp(min=0).square().sum(dim=1) + 1e-16).sqrt()
-    return outside + beyond.amax(dim=1).clamp(max=0)
+def _beyond(
+    x: NDArray[np.float32], kinds: NDArray[np.int64], R: Array, centres: Array, halves: Array
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Return points (4, m) in the frames of primitives (p, 3, m), and their distances.
+
+    Distances are from the planes through the centre, the axis or the centre itself, and beyond the
+    faces. Those in the first two rows of a cylinder, and in all of a sphere, are equal; of spheres
+    alone there is one row.
+    """
+    inverse = R.transpose(0, 2, 1)
+    local = np.concatenate([inverse, -inverse @ centres[:, :, None]], axis=2).astype(np.float32) @ x
+    size = halves.astype(np.float32)[:, :, None]
+    if (kinds == _SPHERE).all():
+        extents = _radial(local)
+        return local, extents, extents - size[:, :1]
+    extents = np.maximum(np.abs(local), np.float32(_SMALL))
+    for kind, axes in ((_CYLINDER, 2), (_SPHERE, 3)):
+        rows = np.flatnonzero(kinds == kind)
+        if len(rows):
+            extents[rows, :axes] = _radial(local[rows, :axes])
+    return local, extents, extents - size
 
 
-def _local(x: torch.Tensor, centres: torch.Tensor, quaternions: torch.Tensor) -> torch.Tensor:
-    """Return points (m, 3) in the frames of primitives, shape (p, 3, m)."""
-    w, a, b, c = (quaternions / quaternions.norm(dim=-1, keepdim=True)).unbind(dim=-1)
-    inverse = torch.stack(
-        [
-            torch.stack([1 - 2 * (b * b + c * c), 2 * (a * b + w * c), 2 * (a * c - w * b)], -1),
-            torch.stack([2 * (a * b - w * c), 1 - 2 * (a * a + c * c), 2 * (b * c + w * a)], -1),
-            torch.stack([2 * (a * c + w * b), 2 * (b * c - w * a), 1 - 2 * (a * a + b * b)], -1),
-        ],
-        dim=1,
-    )
-    return inverse @ x.T - (inverse @ centres[:, :, None])
+def _radial(local: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return distances from an axis or a centre, shape (p, 1, m)."""
+    squares = np.square(local).sum(axis=1, keepdims=True)
+    return np.asarray(np.maximum(np.sqrt(squares), np.float32(_SMALL)))
 
 
 def around(points: Array, axes: list[Array], *, sphere: bool = False) -> Candidates:
@@ -392,10 +425,8 @@ def sample_solid(solid: Solid, seed: int) -> SampledSolid:
 
 def best_single(target: SampledSolid) -> SearchResult:
     """Return the single primitive of largest IoU."""
-    with one_torch_thread():
-        cloud = target.points[target.inside]
-        start = around(cloud, [np.eye(3), target.R_link_box.T], sphere=True)
-        return _refine(target, _ascend_coarsely(target, start, (0.03, 0.008)))
+    cloud = target.points[target.inside]
+    return _search(target, around(cloud, [np.eye(3), target.R_link_box.T], sphere=True))
 
 
 def best_several(target: SampledSolid, fewer: SearchResult, seed: int) -> SearchResult | None:
@@ -405,35 +436,12 @@ def best_several(target: SampledSolid, fewer: SearchResult, seed: int) -> Search
     """
     seeds = [int(child) for child in np.random.SeedSequence(seed).generate_state(NUM_CLUSTERINGS)]
     cloud = target.take(slice(4 * COARSE_POINTS))
-    with one_torch_thread():
-        starts = (
-            by_pieces(cloud, len(fewer.shapes) + 1, seeds),
-            by_growth(fewer.candidate, cloud, seeds[0]),
-        )
-        guesses = [start for start in starts if start is not None]
-        if not guesses:
-            return None
-        return _refine(target, _ascend_coarsely(target, Candidates.stack(guesses), _TAU))
-
-
-def _refine(target: SampledSolid, coarse: Candidates) -> SearchResult:
-    """Improve the best candidates on all points, and return the best one."""
-    order = np.argsort(-overlaps(coarse, target), kind="stable")
-    fine = _ascend_finely(target, coarse.take(order[:NUM_REFINED]))
-    ious = overlaps(fine, target)
-    row = int(np.argmax(ious))
-    return SearchResult(target.shapes(fine, row), float(ious[row]), fine.take(np.array([row])))
-
-
-def _ascend_coarsely(cloud: Cloud, start: Candidates, tau: tuple[float, float]) -> Candidates:
-    """Improve candidates on few sample points."""
-    few = cloud.take(slice(COARSE_POINTS))
-    return ascend(start, few, num_steps=100, tau=tau, rate=(0.01, 0.003))
-
-
-def _ascend_finely(cloud: Cloud, coarse: Candidates) -> Candidates:
-    """Improve candidates on all sample points."""
-    return ascend(coarse, cloud, num_steps=60, tau=(0.006, 0.0015), rate=(0.004, 0.0004))
+    starts = (
+        by_pieces(cloud, len(fewer.shapes) + 1, seeds),
+        by_growth(fewer.candidate, cloud, seeds[0]),
+    )
+    guesses = [start for start in starts if start is not None]
+    return _search(target, Candidates.stack(guesses)) if guesses else None
 
 
 def best_spheres(target: SampledSolid, n: int, cover: float | None, seed: int) -> SearchResult:
@@ -442,14 +450,51 @@ def best_spheres(target: SampledSolid, n: int, cover: float | None, seed: int) -
     emphases = (1.0,) if cover is None else EMPHASES
     # Spheres are chosen for points that did not shape them, or they would cover less of others.
     judge = target if cover is None else sample_solid(target.solid, seeds[-1])
-    with one_torch_thread():
-        start, weights = _starts(target, n, seeds[:NUM_SPHERE_CLUSTERINGS], emphases)
-        coarse = _ascend_coarsely(replace(target, weights=weights), start, _TAU)
-        best = np.array([np.argmax(overlaps(_covering(target, coarse, cover), target))])
-        fine = _ascend_finely(replace(target, weights=weights[best]), coarse.take(best))
-        final = _covering(judge, fine, cover)
-        (iou,) = overlaps(final, judge)
-    return SearchResult(target.shapes(final, 0), float(iou), final)
+    start, weights = _starts(target, n, seeds[:NUM_SPHERE_CLUSTERINGS], emphases)
+    return _search(target, start, weights, cover, judge)
+
+
+def _search(
+    target: SampledSolid,
+    guesses: Candidates,
+    weights: Array | None = None,
+    cover: float | None = None,
+    judge: SampledSolid | None = None,
+) -> SearchResult:
+    """Improve guesses in rounds, and return the best.
+
+    weights: Weights of the points for each guess; by default their volumes.
+    cover: Share of the solid that every candidate is changed to cover before it is counted.
+    judge: Points that the last round is counted on, if others.
+    """
+    best = np.arange(len(guesses.kinds))
+    for how in ROUNDS:
+        best = best[: how.candidates]
+        some = target.take(slice(how.points))
+        if weights is not None:
+            weights = weights[best]
+            some = replace(some, weights=weights[:, : how.points])
+        guesses = ascend(guesses.take(best), some, how)
+        counted = target.take(slice(NUM_COUNTED))
+        if how is ROUNDS[-1]:
+            counted = judge or target
+        final = _covering(counted, guesses, cover)
+        ious = overlaps(final, counted)
+        best = _distinct(guesses, ious)
+    row = int(best[0])
+    return SearchResult(target.shapes(final, row), float(ious[row]), final.take(best[:1]))
+
+
+def _distinct(candidates: Candidates, ious: Array) -> NDArray[np.intp]:
+    """Return the candidates from the best to the worst, of those that are alike only the best."""
+    order = np.argsort(-ious, kind="stable")
+    places = np.concatenate([candidates.centres, np.sort(candidates.halves, axis=2)], axis=2)
+    kept: list[int] = []
+    for i in order.tolist():
+        alike = np.abs(places[kept] - places[i]).max(axis=(1, 2)) < _SAME
+        if not (alike & (candidates.kinds[kept] == candidates.kinds[i]).all(axis=1)).any():
+            kept.append(i)
+    return np.array(kept)
 
 
 def _starts(
@@ -484,7 +529,7 @@ def _covering(cloud: Cloud, candidates: Candidates, cover: float | None) -> Cand
     if cover is None:
         return candidates
     share = 1 - (1 - cover) * (1 - RESERVE)
-    away = _distances(candidates, cloud.points[cloud.inside]).amin(dim=1).double().numpy()
+    away = _distances(candidates, cloud.points[cloud.inside]).astype(np.float64)
     order = np.argsort(away, axis=1)
     weights = cloud.weights[cloud.inside]
     last = np.argmax(np.cumsum(weights[order], axis=1) / weights.sum() >= share, axis=1)

@@ -323,7 +323,7 @@ def _rotate(R: Array, vectors: Array) -> Array:
 
 
 _LOGGER = logging.getLogger(__name__)
-_CACHE_DIR = "tokens-4"
+_CACHE_DIR = "tokens-5"
 """Folder in the user's cache; the number rises when the same shapes get another primitive."""
 DOMINANT_SHARE = 0.95
 """Share of a link's volume from which its largest primitive represents it. The primitive lies in
@@ -340,7 +340,7 @@ def token_shapes(robot: Robot, folders: Sequence[Path] = ()) -> dict[str, Shape]
     2. a primitive of the link that has most of its volume (``DOMINANT_SHARE``), in its canonical
        pose;
     3. the user's cache;
-    4. a new fit, about a second per link, which is then cached. A fit to primitives is the same on
+    4. a new fit, which is then cached. A fit to primitives is the same on
        every machine (``composite``). A fit to meshes depends on the last bits of floating-point
        numbers, so it may differ between machines.
 
@@ -368,8 +368,7 @@ def token_shapes(robot: Robot, folders: Sequence[Path] = ()) -> dict[str, Shape]
                 missing.append((link.name, shapes, path))
     if num_meshes := sum(not are_primitives(shapes) for _, shapes, _ in missing):
         _LOGGER.warning(
-            "fitting the primitives of tokens to %d links of robot %r, a second or more for each; "
-            "they are kept",
+            "fitting the primitives of tokens to %d links of robot %r; they are kept",
             num_meshes,
             robot.name,
         )
@@ -392,7 +391,7 @@ def fit_primitive(shapes: Sequence[Shape]) -> Shape | None:
     """Fit one primitive to shapes that are fixed to each other; None if they have no volume."""
     if are_primitives(shapes):
         return fit_composite(shapes)
-    # The search needs torch, which takes seconds to load.
+    # The search needs packages of the extra fit.
     from morphgen.fitting.link_fit import FitOptions, fit_shapes
 
     try:

@@ -42,7 +42,7 @@ SUFFIX = ".primitives.json"  # suffix of the file of fits beside a part's manife
 FITS = "primitives.json"  # name of the file of fits in a bundle
 MAX_PRIMITIVES = 32  # largest number of primitives in a link's fit
 FITTER_VERSION = 2
-"""Version of the fitter; it rises when the fitter gives other primitives for the same meshes."""
+"""Version of the fitter; it rises when stored fits of earlier ones should be made again."""
 
 _Iou = Annotated[float, Meta(ge=0, le=1)]
 """Intersection over union of the fitted and the original volume."""
