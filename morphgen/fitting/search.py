@@ -120,6 +120,12 @@ ROUNDS = (
     Round(None, COARSE_POINTS, 40, (0.03, 0.008), (0.01, 0.003)),
     Round(2, NEAR_POINTS + FAR_POINTS, 60, (0.006, 0.0015), (0.004, 0.0004)),
 )
+"""Rounds of the search for one primitive, and for spheres."""
+SEVERAL_ROUNDS = (
+    replace(ROUNDS[0], tau=(0.02, 0.006)),
+    replace(ROUNDS[1], candidates=4, steps=50),
+)
+"""Rounds of the search for several primitives, which has more and finer optima."""
 
 
 def ascend(candidates: Candidates, cloud: Cloud, how: Round) -> Candidates:
@@ -426,7 +432,8 @@ def sample_solid(solid: Solid, seed: int) -> SampledSolid:
 def best_single(target: SampledSolid) -> SearchResult:
     """Return the single primitive of largest IoU."""
     cloud = target.points[target.inside]
-    return _search(target, around(cloud, [np.eye(3), target.R_link_box.T], sphere=True))
+    guesses = around(cloud, [np.eye(3), target.R_link_box.T], sphere=True)
+    return _search(target, guesses, ROUNDS)
 
 
 def best_several(target: SampledSolid, fewer: SearchResult, seed: int) -> SearchResult | None:
@@ -441,7 +448,7 @@ def best_several(target: SampledSolid, fewer: SearchResult, seed: int) -> Search
         by_growth(fewer.candidate, cloud, seeds[0]),
     )
     guesses = [start for start in starts if start is not None]
-    return _search(target, Candidates.stack(guesses)) if guesses else None
+    return _search(target, Candidates.stack(guesses), SEVERAL_ROUNDS) if guesses else None
 
 
 def best_spheres(target: SampledSolid, n: int, cover: float | None, seed: int) -> SearchResult:
@@ -451,12 +458,13 @@ def best_spheres(target: SampledSolid, n: int, cover: float | None, seed: int) -
     # Spheres are chosen for points that did not shape them, or they would cover less of others.
     judge = target if cover is None else sample_solid(target.solid, seeds[-1])
     start, weights = _starts(target, n, seeds[:NUM_SPHERE_CLUSTERINGS], emphases)
-    return _search(target, start, weights, cover, judge)
+    return _search(target, start, ROUNDS, weights, cover, judge)
 
 
 def _search(
     target: SampledSolid,
     guesses: Candidates,
+    rounds: tuple[Round, ...],
     weights: Array | None = None,
     cover: float | None = None,
     judge: SampledSolid | None = None,
@@ -468,7 +476,7 @@ def _search(
     judge: Points that the last round is counted on, if others.
     """
     best = np.arange(len(guesses.kinds))
-    for how in ROUNDS:
+    for how in rounds:
         best = best[: how.candidates]
         some = target.take(slice(how.points))
         if weights is not None:
@@ -476,7 +484,7 @@ def _search(
             some = replace(some, weights=weights[:, : how.points])
         guesses = ascend(guesses.take(best), some, how)
         counted = target.take(slice(NUM_COUNTED))
-        if how is ROUNDS[-1]:
+        if how is rounds[-1]:
             counted = judge or target
         final = _covering(counted, guesses, cover)
         ious = overlaps(final, counted)
