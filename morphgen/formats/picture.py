@@ -12,10 +12,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from morphgen.errors import MissingDependencyError
 from morphgen.formats.quiet import log_mujoco_warnings
+from morphgen.model.geometry import Pose
 from morphgen.model.inertia import bounding_box, box_corners
 from morphgen.model.kinematics import forward_kinematics, movable_positions
 from morphgen.model.robot import Robot
@@ -24,6 +24,7 @@ from morphgen.typing import Array
 SIZE = (640, 480)  # width and height of a picture [px]
 _FOV = 35.0  # vertical field of view [deg]
 _YAW, _PITCH = 50.0, -20.0  # direction of the camera [deg]
+_CAMERA = Pose.from_xyz_rpy(rpy=(math.radians(_PITCH), 0.0, math.radians(_YAW)))
 _MARGIN = 0.92  # share of the picture that the robot may fill
 
 
@@ -96,7 +97,7 @@ def _framing(robot: Robot, q: Array, aspect: float) -> tuple[Array, float]:
         if link.visuals or link.collisions:
             corners = box_corners(*bounding_box(link.visuals or link.collisions))
             points.append(corners @ T[:3, :3].T + T[:3, 3])
-    axes = Rotation.from_euler("ZX", [_YAW, _PITCH], degrees=True).as_matrix()
+    axes = _CAMERA.matrix[:3, :3]
     across, ahead, up = (np.concatenate(points) @ axes).T
     middle = np.array([(v.min() + v.max()) / 2 for v in (across, ahead, up)])
     tangent = _MARGIN * math.tan(math.radians(_FOV / 2))
