@@ -16,7 +16,6 @@ from lxml import etree
 
 from morphgen.formats.bundle import MJCF, URDF, mesh_file
 from morphgen.formats.description import is_mjcf
-from morphgen.formats.mjcf.compile import compile_document
 from morphgen.formats.mjcf.document import read_document, remove_element
 from morphgen.formats.resolve import PackageFinder, default_finder, resolve_uri
 from morphgen.formats.urdf.read import (
@@ -67,6 +66,8 @@ def loader_copy(path: Path, finder: PackageFinder | None = None) -> Iterator[Pat
 
 
 def _copy_mjcf(path: Path, folder: Path, finder: PackageFinder) -> None:
+    from morphgen.formats.mjcf.compile import compile_document  # loads trimesh
+
     document = read_document(path, finder, with_options=True)
     compile_document(document)
     root = etree.fromstring(document.text)
