@@ -50,11 +50,10 @@ def robot_urdf(tmp_path):
 @pytest.fixture
 def xacro_here(monkeypatch):
     """Expand xacro files of users in this process; the limits of its own have other tests."""
-    for module in ("compile", "expand"):
-        monkeypatch.setattr(
-            f"morphgen.formats.xacro.{module}.run_in_child",
-            lambda task, path, finder, **values: task(path, finder, **values),
-        )
+    monkeypatch.setattr(
+        "morphgen.formats.xacro.expand.run_in_child",
+        lambda task, path, finder, **values: task(path, finder, **values),
+    )
     limit = sys.getrecursionlimit()
     sys.setrecursionlimit(4 * limit)  # as in that process
     yield
