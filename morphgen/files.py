@@ -111,9 +111,9 @@ _ROOMS = ("model", "formats", "formats/mjcf", "formats/urdf", "formats/xacro", "
 MAX_KEPT = 2**29
 """Size of all kept values above which those are removed that were not used for longest [bytes]."""
 _USED_AGAIN = 86_400.0  # time after which reading an entry counts as a new use [s]
+_FAULTS = (ArithmeticError, LookupError, RecursionError, TypeError, ValueError)
 """Exceptions that a file which is no entry can raise."""
 _room = 0  # number of bytes that may be kept before the folder is measured again
-_FAULTS = (ArithmeticError, LookupError, RecursionError, TypeError, ValueError)
 
 
 def read_kept(kind: str, key: Sequence[object], types: Sequence[type] = ()) -> Any:  # noqa: ANN401
