@@ -482,7 +482,8 @@ class Learner:
             loss.backward()  # type: ignore[no-untyped-call]
             return metrics
 
-        if not is_host(self.device):  # a second CUDA graph would overwrite the first one's results
+        # A second CUDA graph overwrites the results of the first, and torch compiles in one thread.
+        if self.config.compile or not is_host(self.device):
             return add(self._run_loss)
         of_actor, of_critic = self._run_losses
         # The networks share nothing, and torch computes without Python's lock.
