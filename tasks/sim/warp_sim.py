@@ -117,15 +117,13 @@ def _tested_pairs(model: Model, ngeom: int) -> NDArray[np.bool_]:
     return tested
 
 
-def _have_one_material(*scenes: World) -> bool:
+def _have_one_material(*members: World) -> bool:
     """Return whether all contacts between geoms without priority are alike: of links and ground."""
-    rows = [
-        np.column_stack([getattr(scene.model, name) for name in MATERIAL])[
-            scene.model.geom_priority == 0
-        ]
-        for scene in scenes
-    ]
-    return bool((np.concatenate(rows) == rows[0][0]).all())
+    models = [world.model for world in members]
+    columns = [np.concatenate([getattr(model, name) for model in models]) for name in MATERIAL]
+    is_plain = np.concatenate([model.geom_priority for model in models]) == 0
+    rows = np.column_stack(columns)[is_plain]
+    return bool((rows == rows[:1]).all())
 
 
 def put_model(structure: Structure, device: str) -> Model:
@@ -553,7 +551,8 @@ class _StepGraph:
         with wp.ScopedDevice(device):
             for group in groups:
                 group.step()  # loads what ``kernels_of`` missed: a capture cannot
-            self._streams = main, *branches = [wp.Stream(device) for _ in (None, *groups)]
+            self._streams = [wp.Stream(device) for _ in (None, *groups)]
+            main, *branches = self._streams
             wp.synchronize_device(device)
             with wp.ScopedStream(main), wp.ScopedCapture(stream=main) as capture:
                 begun = main.record_event()

@@ -120,6 +120,14 @@ def test_structures_differ_where_the_library_has_one_value_for_all_worlds():
     assert [each.envs.tolist() for each in groups] == [[0, 3], [1], [2]]
 
 
+def test_a_robot_without_collision_shapes_is_a_structure_of_its_own():
+    arm = robot("arm=arm3 ee=stick")
+    bare = replace(arm, links=tuple(replace(link, collisions=()) for link in arm.links))
+    scenes = [Scene(each, ground=None) for each in (bare, arm)]
+    groups = structures(scenes, worlds(scenes, Contacts()))
+    assert [each.envs.tolist() for each in groups] == [[0], [1]]
+
+
 def test_robots_of_one_structure_test_their_own_pairs():
     base = robot("arm=arm3 ee=stick")
     first, *_, arm_tip, stick = (link.name for link in base.links if link.collisions)
