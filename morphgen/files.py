@@ -151,6 +151,18 @@ def keep(kind: str, key: Sequence[object], value: object) -> None:
     keep_file(path, zlib.crc32(body).to_bytes(4, "big") + body, "compiled parts and meshes")
 
 
+def kept(kind: str, key: Sequence[object], make: Callable[[], T], types: Sequence[type] = ()) -> T:
+    """Return a value of the user's cache, which is made and kept if it is not there.
+
+    types: See ``read_kept``.
+    """
+    found: T | None = read_kept(kind, key, types)
+    if found is None:
+        found = make()
+        keep(kind, key, found)
+    return found
+
+
 def _kept_path(kind: str, key: Sequence[object]) -> Path:
     import msgspec
     from platformdirs import user_cache_path

@@ -232,8 +232,11 @@ class Learner:
         ready = partial(prepared, device=self.device, bf16=config.bf16, compiled=config.compile)
         self._run_actor = ready(self.actor)
         self._run_critic = ready(self.target_critic if config.slow_critic else self.critic)
-        self._run_losses = ready(self._actor_loss), ready(self._critic_loss)
-        self._run_loss = ready(self._loss)
+        # The networks share nothing, so on a CPU each has a loss, in a thread of its own. A second
+        # CUDA graph would overwrite the results of the first, and torch compiles in one thread.
+        apart = is_host(self.device) and not config.compile
+        losses = (self._actor_loss, self._critic_loss) if apart else (self._loss,)
+        self._run_losses = tuple(map(ready, losses))
 
         # The rollout, (T, n, ...). What the networks read and write is on the learner's device.
         obs, T, n = self._network_input(observation), config.num_steps, batch.num_envs
@@ -482,13 +485,9 @@ class Learner:
             loss.backward()  # type: ignore[no-untyped-call]
             return metrics
 
-        # A second CUDA graph overwrites the results of the first, and torch compiles in one thread.
-        if self.config.compile or not is_host(self.device):
-            return add(self._run_loss)
-        of_actor, of_critic = self._run_losses
-        # The networks share nothing, and torch computes without Python's lock.
-        critic = self._helper.submit(add, of_critic)
-        return torch.cat([add(of_actor), critic.result()])
+        first, *others = self._run_losses
+        running = [self._helper.submit(add, loss_of) for loss_of in others]
+        return torch.cat([add(first), *(each.result() for each in running)])
 
     def _loss(
         self, obs: Observation, minibatch: Mapping[str, torch.Tensor], weights: torch.Tensor

@@ -46,16 +46,6 @@ from morphgen.grammar.library import LibraryFolders, default_library
 from morphgen.grammar.robot_source import RobotLike, RobotReference, find_robot, read_source
 from morphgen.model.robot import Robot
 
-_WITH_PAIRS = ("srdf", "curobo", "ros2")
-_WITH_SPHERES = ("srdf", "urdf", "mjcf", "sdf", "curobo", "usd", "ros2")
-_FORMATS = {
-    "dark": ("html",),
-    "samples": _WITH_PAIRS,
-    "seed": _WITH_PAIRS,
-    "spheres": _WITH_SPHERES,
-}
-"""Formats of arguments that have no effect on others."""
-
 
 @checked_signature
 @explain_missing_extras()

@@ -25,13 +25,13 @@ from platformdirs import user_cache_path
 
 from morphgen.checks.self_collision import survey_collisions
 from morphgen.errors import FitError, FormatError, nearest, one_line
+from morphgen.files import keep_file
 from morphgen.formats.files import replacing_folder
 from morphgen.formats.fits import (
     FITTER_VERSION,
     find_fit,
     fits_text,
     has_meshes,
-    keep_fit,
     read_fits,
     read_stored_fits,
     shapes_key,
@@ -193,7 +193,8 @@ def _fit_and_keep(
     for name, fit in fits.items():
         shapes = robot.link(name).collisions
         key = shapes_key(shapes)
-        keep_fit(_path(kind, key), fits_text({key: fit.scaled(1 / shapes_scale(shapes))}))
+        text = fits_text({key: fit.scaled(1 / shapes_scale(shapes))})
+        keep_file(_path(kind, key), text, "fits")
     return fits
 
 

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from platformdirs import user_cache_path
 
 from morphgen.errors import FitError, FormatError
+from morphgen.files import keep_file
 from morphgen.fitting.canonical import KINDS, Kind, canonical, rounded
 from morphgen.formats.data_files import read_json
 from morphgen.formats.fits import (
     ShapeRecord,
     are_primitives,
     find_fit,
-    keep_fit,
     read_stored_fits,
     shape_to_data,
     shapes_key,
@@ -424,4 +424,4 @@ def _read_cached(path: Path, scale: float) -> Shape | None:
 
 def _write_cached(path: Path, shape: Shape | None, scale: float) -> None:
     data = None if shape is None else shape_to_data(scale_shape(shape, 1 / scale))
-    keep_fit(path, json.dumps(data))
+    keep_file(path, json.dumps(data), "fits")

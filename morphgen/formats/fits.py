@@ -18,7 +18,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from morphgen.files import cached_until_changed, content_sha256, keep_file
+from morphgen.files import cached_until_changed, content_sha256
 from morphgen.formats.data_files import read_bytes, read_json
 from morphgen.formats.records import FiniteNumber, PositiveNumber, Record, read_record
 from morphgen.formats.rounding import format_number
@@ -230,8 +230,3 @@ def _geometry_text(geometry: Geometry) -> str:
         scale = map(format_number, geometry.scale)
         return " ".join(["mesh", content_sha256(geometry.path), *scale, str(geometry.part)])
     return " ".join([_KINDS[type(geometry)], *map(format_number, dimensions(geometry))])
-
-
-def keep_fit(path: Path, text: str) -> None:
-    """Write a file of the user's cache of fits; if that fails, say so once for its folder."""
-    keep_file(path, text, "fits")

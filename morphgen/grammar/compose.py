@@ -8,7 +8,7 @@ from functools import lru_cache
 
 from morphgen.checks.self_collision import CollisionSurvey, survey_collisions
 from morphgen.errors import CompositionError, nearest
-from morphgen.files import keep, read_kept
+from morphgen.files import kept
 from morphgen.formats.fits import with_stored_fits
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.library import Library
@@ -239,10 +239,10 @@ def _ignored_in_part(part: Part) -> tuple[Pair, ...]:
     fragment = part.fragment
     collisions = (shape.geometry for link in fragment.links for shape in link.collisions)
     key = (fragment, *(mesh_key(each) for each in collisions if isinstance(each, Mesh)))
-    if None in key:
+
+    def make() -> tuple[Pair, ...]:
         return survey_collisions(fragment).ignore_pairs
-    pairs: tuple[Pair, ...] | None = read_kept("pairs", key)
-    if pairs is None:
-        pairs = survey_collisions(fragment).ignore_pairs
-        keep("pairs", key, pairs)
-    return pairs
+
+    if None in key:
+        return make()
+    return kept("pairs", key, make)

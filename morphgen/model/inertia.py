@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from morphgen.errors import RobotError
-from morphgen.files import keep, read_kept
+from morphgen.files import kept
 from morphgen.model.geometry import (
     Box,
     Capsule,
@@ -90,11 +90,7 @@ def _union_moments(shapes: tuple[Shape, ...], _stamps: tuple[int, ...]) -> Array
     is_known = all(geometry is not None for geometry, _, _ in key)
     if not is_known or not any(isinstance(shape.geometry, Mesh) for shape in shapes):
         return _make_moments(shapes)
-    found: Array | None = read_kept("moments", key)
-    if found is None:
-        found = _make_moments(shapes)
-        keep("moments", key, found)
-    return found
+    return kept("moments", key, lambda: _make_moments(shapes))
 
 
 def _geometry_key(geometry: Geometry) -> tuple[object, ...] | None:
@@ -164,13 +160,13 @@ def solid_triangles(geometry: Geometry) -> Triangles:
 @lru_cache(maxsize=3)
 def _unit_solid(kind: str) -> Triangles:
     """Return the triangles of a primitive whose dimensions are all 1, from the user's cache."""
-    found: Triangles | None = read_kept("solid", (kind,), (Triangles,))
-    if found is None:
+
+    def make() -> Triangles:
         units = (Box((1.0, 1.0, 1.0)), Sphere(1.0), Cylinder(1.0, 1.0))
         mesh = solid_mesh(next(unit for unit in units if type(unit).__name__ == kind))
-        found = Triangles(np.array(mesh.vertices), np.array(mesh.faces))
-        keep("solid", (kind,), found)
-    return found
+        return Triangles(np.array(mesh.vertices), np.array(mesh.faces))
+
+    return kept("solid", (kind,), make, (Triangles,))
 
 
 def link_frame_mesh(shape: Shape) -> trimesh.Trimesh:

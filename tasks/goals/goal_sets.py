@@ -9,7 +9,6 @@ import hashlib
 import io
 import json
 import lzma
-import warnings
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import cache
@@ -23,7 +22,7 @@ from platformdirs import user_cache_path
 
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import BenchmarkError, NoGoalsError, TaskError
-from morphgen.files import write_cache_file
+from morphgen.files import keep_file
 from morphgen.formats.zip_files import read_npz
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import Robot
@@ -114,20 +113,12 @@ def goal_set(
         )
     except NoGoalsError as error:
         if not anew:  # to find none takes longer than to find some
-            _store(refusal, str(error).removeprefix(f"robot {robot.name!r} ").encode())
+            keep_file(refusal, str(error).removeprefix(f"robot {robot.name!r} "), "goals")
         raise
     require_returned(task.name, "sample", goals, isinstance(goals, kind), kind.__name__)
     if not anew:
-        _store(path, set_npz(goals))
+        keep_file(path, set_npz(goals), "goals")
     return goals
-
-
-def _store(path: Path, content: bytes) -> None:
-    """Write a file of the cache, or warn that it cannot be written."""
-    try:
-        write_cache_file(path, content)
-    except OSError as error:
-        warnings.warn(f"cannot store goals in {path}: {error.strerror}", stacklevel=3)
 
 
 def goal_set_key(
