@@ -66,7 +66,7 @@ def main() -> int:
 
 def _row(args: argparse.Namespace, number: int) -> Row:
     robots = list(morphgen.sample(args.grammar, number))
-    scenes = [Scene(robots[i % number], block=BLOCK) for i in range(args.envs)]
+    scenes = [Scene(robots[i % number], object=BLOCK) for i in range(args.envs)]
     found = structures(scenes[:number], worlds(scenes[:number], Contacts()))
     kinds = [scenes[int(structure.envs[0])] for structure in found]
     shares = [len(structure.envs) for structure in found]

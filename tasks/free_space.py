@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from morphgen.checks.self_collision import SelfCollisionChecker, untested_pairs
 from morphgen.errors import BenchmarkError
-from morphgen.model.geometry import Box, Pose, Shape, Sphere
+from morphgen.model.geometry import IDENTITY, Box, Pose, Shape, Sphere
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import (
     driving_joints,
@@ -26,6 +26,7 @@ from morphgen.model.kinematics import (
 from morphgen.model.robot import TOOL, Joint, JointKind, Link, Pair, Robot, sorted_pair
 from morphgen.model.rotation import Vec3, normalize, to_rpy
 from morphgen.model.tree import rigid_groups
+from morphgen.tasks.sim.articulated import ArticulatedObject
 from morphgen.tasks.sim.base import Scene
 from morphgen.typing import Array
 
@@ -163,8 +164,10 @@ class FreeSpace:
         link_names = {link.name for link in scene.robot.links}
         self._obstacles = [_unused(f"obstacle{k}", link_names) for k in range(len(scene.obstacles))]
         self._block = _unused("block", link_names)
+        bases = [_unused("base", link_names)] if _base_shapes(scene) else []
+        self._num_static = len(self._obstacles) + len(bases)
         self._checker = SelfCollisionChecker(
-            _with_surroundings(scene, self._obstacles, self._block)
+            _with_surroundings(scene, self._obstacles, bases, self._block)
         )
 
     def free(self, q: ArrayLike, blocks: ArrayLike | None = None) -> NDArray[np.bool_]:
@@ -289,13 +292,13 @@ class FreeSpace:
             raise ValueError(f"q has shape {q.shape}; {robot.name} needs (n, {robot.dof})")
         if not np.isfinite(q).all():  # NaN collides with nothing, and would be free
             raise ValueError(f"q of {robot.name} is not finite")
-        slides = np.zeros((len(q), len(self._obstacles)))
+        slides = np.zeros((len(q), self._num_static))
         return np.concatenate([q, slides, self._block_joints(blocks, len(q))], axis=1)
 
     def _block_joints(self, blocks: ArrayLike | None, n: int) -> Array:
         """Return the block's virtual joint positions, shape (n, 6), or (n, 0) without a block."""
         if blocks is None:
-            return np.tile(_AWAY, (n, 1)) if self.scene.block else np.zeros((n, 0))
+            return np.tile(_AWAY, (n, 1)) if self.scene.object else np.zeros((n, 0))
         blocks = np.asarray(blocks, dtype=np.float64)
         self._require_blocks(blocks, n)
         turns = [to_rpy(normalize((w, x, y, z))) for w, x, y, z in blocks[:, 3:].tolist()]
@@ -303,7 +306,7 @@ class FreeSpace:
 
     def _require_blocks(self, blocks: Array, n: int) -> None:
         """Require n finite poses of the block, and a block."""
-        if self.scene.block is None or blocks.shape != (n, 7):
+        if self.scene.object is None or blocks.shape != (n, 7):
             raise ValueError(
                 f"blocks have shape {blocks.shape}; {n} configurations need ({n}, 7), and a scene "
                 "with a block"
@@ -323,8 +326,7 @@ def outside_limits(robot: Robot, q: Array) -> Iterator[tuple[int, str]]:
 
 def _may_touch(scene: Scene, blocks: Array) -> NDArray[np.bool_]:
     """Return where the block's sphere meets a box around the robot's base or an obstacle, (n,)."""
-    assert scene.block is not None
-    radius = float(np.linalg.norm(scene.block.size)) / 2
+    radius = float(np.linalg.norm(np.abs(bounding_box(scene.object_shapes)).max(axis=0)))
     T_world_root, robot = scene.T_world_root.matrix, scene.robot
     T_root_link = forward_kinematics(robot, np.array(robot.home))
     boxes = [
@@ -343,11 +345,18 @@ def _may_touch(scene: Scene, blocks: Array) -> NDArray[np.bool_]:
     return near
 
 
-def _with_surroundings(scene: Scene, obstacles: Sequence[str], block: str) -> Robot:
+def _base_shapes(scene: Scene) -> tuple[Shape, ...]:
+    """Return the shapes of an articulated object that stand still, in its root frame."""
+    return scene.object.base_shapes if isinstance(scene.object, ArticulatedObject) else ()
+
+
+def _with_surroundings(
+    scene: Scene, obstacles: Sequence[str], bases: Sequence[str], block: str
+) -> Robot:
     """Return the robot with ground, obstacles, block and tool point as further links.
 
-    The ground is fixed to the root: links that are fixed to each other are never tested. Obstacles
-    must be tested against the root too, so each is on a virtual slide that stays at zero. The block
+    The ground is fixed to the root: links that are fixed to each other are never tested. Obstacles,
+    among them the base of an articulated object, must be tested against the root too, so each is on a virtual slide that stays at zero. The block
     has virtual joints for every direction.
     """
     robot = scene.robot
@@ -371,17 +380,22 @@ def _with_surroundings(scene: Scene, obstacles: Sequence[str], block: str) -> Ro
         static_links.append(Link(name, collisions=(Shape(Box(obstacle.size)),)))
         at = (world.name, name, obstacle.pose)
         new_joints.append(Joint(joint_name(name), "prismatic", *at, limits=(0.0, 0.0)))
-    ignored = [*untested_pairs(robot), *combinations([link.name for link in static_links], 2)]
+    for base in bases:  # of an articulated object, another obstacle
+        static_links.append(Link(base, collisions=_base_shapes(scene)))
+        at = (world.name, base, scene.object.pose if scene.object else IDENTITY)
+        new_joints.append(Joint(joint_name(base), "prismatic", *at, limits=(0.0, 0.0)))
+    ignored = [*untested_pairs(robot), *((base, block) for base in bases)]
+    ignored += [*combinations([link.name for link in static_links], 2)]
     block_links: list[Link] = []
-    if scene.block is not None:
+    if scene.object is not None:
         if scene.ground is not None:
             ignored.append((block, static_links[0].name))
         for kind, axis in _MOTIONS:
             is_last = len(block_links) == len(_MOTIONS) - 1
             name = block if is_last else _unused(f"carrier{len(block_links)}", link_names)
-            cube = (Shape(Box(scene.block.size)),) if is_last else ()
+            shapes = scene.object_shapes if is_last else ()
             parent = block_links[-1].name if block_links else world.name
-            block_links.append(Link(name, collisions=cube))
+            block_links.append(Link(name, collisions=shapes))
             new_joints.append(Joint(joint_name(name), kind, parent, name, axis=axis))
     tool_links: list[Link] = []
     for frame in robot.frames:
@@ -393,13 +407,13 @@ def _with_surroundings(scene: Scene, obstacles: Sequence[str], block: str) -> Ro
             ignored += [
                 (point.name, link.name)
                 for link in (*robot.links, *static_links)
-                if link.name not in obstacles
+                if link.name not in (*obstacles, *bases)
             ]
     return replace(
         robot,
         links=(world, *robot.links, *static_links, *block_links, *tool_links),
         joints=(to_root, *robot.joints, *new_joints),
-        home=(*robot.home, *(0.0 for _ in obstacles), *(_AWAY if block_links else ())),
+        home=(*robot.home, *(0.0 for _ in (*obstacles, *bases)), *(_AWAY if block_links else ())),
         ignore_pairs=tuple(ignored),
     )
 

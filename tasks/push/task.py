@@ -85,7 +85,7 @@ class Push(Task[PushConfig, PushStartSet]):
         region = push_region(robot, config, ground, np.random.default_rng(region_seeds))
         edge = region.edge
         block = Block((edge, edge, edge), mass=config.block_mass, friction=config.friction)
-        space = FreeSpace(Scene(robot, block=block, ground=ground))
+        space = FreeSpace(Scene(robot, object=block, ground=ground))
         test = FeasibilityTest(space, region, np.random.default_rng(test_seeds))
         starts, tried = draw_feasible(robot, config.num_goals, region, test, ground, block_seeds)
         blocks, behind, across = (np.array(column) for column in zip(*starts, strict=True))
@@ -134,12 +134,12 @@ class Push(Task[PushConfig, PushStartSet]):
         faults = layout_faults(goals, robot, scene, feasible_starts, block=goals.block)
         for name, q in configurations.items():
             faults += [f"start {i}: {name}: {reason}" for i, reason in outside_limits(robot, q)]
-        space = FreeSpace(replace(scene, robot=robot, block=goals.block, obstacles=()))
+        space = FreeSpace(replace(scene, robot=robot, object=goals.block, obstacles=()))
         return [*faults, *start_faults(goals, space)]
 
     def scene(self, robot: Robot, goals: PushStartSet, ground: float) -> Scene:
         """Return the scene with the block."""
-        return Scene(robot, block=goals.block, obstacles=goals.obstacles, ground=ground)
+        return Scene(robot, object=goals.block, obstacles=goals.obstacles, ground=ground)
 
     def make_envs(
         self, specs: Sequence[EnvSpec], env_spec_index: torch.Tensor, num_joints: int

@@ -33,7 +33,9 @@ from morphgen.model.rotation import Vec3
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.obstacles import place_boxes
+from morphgen.tasks.sim.articulated import ArticulatedObject
 from morphgen.tasks.sim.base import Block, Scene
+from morphgen.tasks.sim.mujoco_model import add_shape
 from morphgen.tasks.task import EnvSpec, Marker
 from morphgen.typing import Array
 
@@ -242,9 +244,15 @@ class Renderer:
             obstacles[-1].pos, obstacles[-1].quat = obstacle.pose.position, obstacle.pose.quaternion
             _add_box(obstacles[-1], obstacle.size, _OBSTACLE)
         bodies = {}
-        if scene.block is not None:
+        if scene.object is not None:
             bodies[BLOCK] = spec.worldbody.add_body(mocap=True)
-            _add_box(bodies[BLOCK], scene.block.size, _BLOCK)
+            for shape in scene.object_shapes:
+                add_shape(bodies[BLOCK], shape).rgba = shape.rgba or _BLOCK
+        if isinstance(scene.object, ArticulatedObject):
+            base = spec.worldbody.add_body()
+            base.pos, base.quat = scene.object.pose.position, scene.object.pose.quaternion
+            for shape in scene.object.base_shapes:
+                add_shape(base, shape).rgba = shape.rgba or _OBSTACLE
         for marker in markers:
             bodies[marker.name] = _add_marker(spec, marker)
         model = spec.compile()
@@ -326,7 +334,7 @@ class Renderer:
 def render_state(batch: TaskBatch, env: int = 0) -> RenderState:
     """Return the current state of an environment of a batch."""
     spec = batch.specs[int(batch.env_robot_index[env])]
-    block = None if spec.scene.block is None else _copied(batch.simulation.block_pose[env])
+    block = None if spec.scene.object is None else _copied(batch.simulation.block_pose[env])
     return RenderState(
         _copied(batch.q[env, : spec.robot.dof]),
         block,

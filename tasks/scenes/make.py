@@ -289,8 +289,8 @@ def _require_contacts(
             f"collision geometry {geometry!r}: simulator {simulator.name!r} has no contacts"
         )
     for spec in specs:
-        if spec.scene.block is not None or spec.scene.obstacles:
-            thing = "a block" if spec.scene.block is not None else "obstacles"
+        if spec.scene.object is not None or spec.scene.obstacles:
+            thing = "an object" if spec.scene.object is not None else "obstacles"
             others = installed_simulators(lambda other: other.simulates_contacts)
             raise TaskError(
                 f"simulator {simulator.name!r} has no contacts, and {spec.task} of "

@@ -98,7 +98,7 @@ def draw_layouts(
     single precision, as simulators have them; and which goals they leave possible, (L, G).
     """
     probe_seeds, *side_seeds = seeds.spawn(3)
-    plain = FreeSpace(replace(space.scene, obstacles=(), block=None))
+    plain = FreeSpace(replace(space.scene, obstacles=(), object=None))
     probes, _ = plain.sample(PROBES, np.random.default_rng(probe_seeds))
     layouts, masks = [], []
     for side, count in zip(side_seeds, counts, strict=True):
@@ -215,7 +215,7 @@ def layout_faults(
     if not shape[0] or place_boxes(goals.obstacles, goals.layouts[0]) != goals.obstacles:
         return ["the obstacles are not at the poses of the first layout"]
     faults = []
-    space = FreeSpace(replace(scene, robot=robot, block=block))
+    space = FreeSpace(replace(scene, robot=robot, object=block))
     for k, layout in enumerate(goals.layouts):
         space.place_obstacles(poses_of(layout))
         if space.obstacle_hits([robot.home]).any():

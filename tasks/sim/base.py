@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.errors import SimulationError
+from morphgen.model import rotation
 from morphgen.model.dynamics import GRAVITY as GRAVITY  # robots carry their own weight
-from morphgen.model.geometry import IDENTITY, Pose
+from morphgen.model.geometry import IDENTITY, Box, Pose, Shape
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
 from morphgen.processes import usable_cores
+from morphgen.tasks.sim.articulated import ArticulatedObject, ObjectJoints
 from morphgen.typing import Array
 
 if TYPE_CHECKING:  # processes of PyBullet need no torch, which takes seconds to load and 200 MB
@@ -57,15 +59,36 @@ class Block:
 
 @dataclass(frozen=True)
 class Scene:
-    """Content of an environment: a robot with a fixed root, a movable block and obstacles."""
+    """Content of an environment: a robot with a fixed root, an object that moves and obstacles."""
 
     robot: Robot
     T_world_root: Pose = IDENTITY
-    block: Block | None = None
-    """Box with a mass that the robot can push; None without one."""
+    object: Block | ArticulatedObject | None = None
+    """Thing that the robot can move: a box with a mass, or an articulated object."""
     obstacles: tuple[Block, ...] = ()
     ground: float | None = 0.0
     """Height of a ground plane, or None without one [m]; the root link does not collide with it."""
+
+    @property
+    def block(self) -> Block | None:
+        """The object, if it is a box."""
+        return self.object if isinstance(self.object, Block) else None
+
+    @property
+    def object_shapes(self) -> tuple[Shape, ...]:
+        """Collision shapes of the object, or of its link that moves; none without one."""
+        if isinstance(self.object, ArticulatedObject):
+            return self.object.moving_shapes
+        return () if self.object is None else (Shape(Box(self.object.size)),)
+
+    @property
+    def object_pose(self) -> Pose | None:
+        """Pose in the world of the object, or of its link that moves, at home; None without one."""
+        if not isinstance(self.object, ArticulatedObject):
+            return None if self.object is None else self.object.pose
+        rest = ObjectJoints([self.object]).poses(np.array(self.object.body.home))[0].tolist()
+        x, y, z, *quaternion = rest
+        return Pose((x, y, z), rotation.normalize((*quaternion,)))
 
 
 def all_finite(values: NDArray[Any]) -> bool:
@@ -80,7 +103,7 @@ class Contacts:
     """Pairs of things that collide."""
 
     scene: bool = True
-    """Whether the robot collides with the ground, the block and obstacles."""
+    """Whether the robot collides with the ground, the object and obstacles."""
     self_collision: bool = True
     """Whether links collide with each other, except neighbours and ``Robot.ignore_pairs``."""
 
@@ -103,7 +126,8 @@ class Simulation(ABC):
     qd: torch.Tensor
     """Velocities of the independent joints, shape (n, J) [rad/s or m/s]."""
     block_pose: torch.Tensor
-    """Poses of the blocks in the world: x, y, z, qw, qx, qy, qz, (n, 7); zeros without one."""
+    """Poses in the world of the blocks, or of the links of articulated objects that move, which
+    determine their joints: x, y, z, qw, qx, qy, qz, (n, 7); zeros without an object."""
 
     def __init__(self, scenes: Sequence[Scene], device: torch.device) -> None:
         """Keep the scene of each environment."""
@@ -206,9 +230,10 @@ class Simulation(ABC):
         obstacles = torch.zeros(n, self._num_obstacles, 7)
         for env, scene in enumerate(self.scenes):
             q[env, : scene.robot.dof] = torch.tensor(scene.robot.home)
-            boxes = [] if scene.block is None else [(block[env], scene.block)]
-            for row, box in (*boxes, *zip(obstacles[env], scene.obstacles, strict=False)):
-                row[:] = torch.tensor((*box.pose.position, *box.pose.quaternion))
+            poses = [obstacle.pose for obstacle in scene.obstacles]
+            moving = [] if scene.object_pose is None else [(block[env], scene.object_pose)]
+            for row, pose in (*moving, *zip(obstacles[env], poses, strict=False)):
+                row[:] = torch.tensor((*pose.position, *pose.quaternion))
         tensors = (torch.ones(n, dtype=torch.bool), q, block, obstacles)
         self.reset(*(tensor.to(self.device) for tensor in tensors))
 
@@ -238,7 +263,7 @@ class HostSimulation(Simulation):
         super().__init__(scenes, torch.device("cpu"))
         dofs = np.array([scene.robot.dof for scene in scenes])
         self._is_joint: NDArray[np.bool_] = np.arange(dofs.max()) < dofs[:, None]
-        self._has_block = np.array([[scene.block is not None] for scene in scenes])
+        self._has_block = np.array([[scene.object is not None] for scene in scenes])
         self._targets: Array = np.zeros(self._is_joint.shape)
         self._seen: torch.Tensor | None = None
         self._num_steps, self._reset_at = 0, np.zeros(len(scenes), np.int64)

@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 
 from morphgen.errors import SimulationError
 from morphgen.formats.bundle import URDF, write_bundle
+from morphgen.model.robot import Robot
+from morphgen.tasks.sim.articulated import ArticulatedObject
 from morphgen.tasks.sim.base import Contacts, HostSimulation, Scene, Simulator
 from morphgen.tasks.sim.bullet_batch import (
     BulletBatch,
-    ExportedRobot,
+    Exported,
     Float32,
     Share,
     Worker,
@@ -53,7 +55,7 @@ class BulletSimulation(HostSimulation):
         self._free = weakref.finalize(self, resources.close)
         try:
             folder = resources.enter_context(tempfile.TemporaryDirectory(prefix="morphgen-"))
-            exported = export_robots(scenes, Path(folder))
+            exported = export_scenes(scenes, Path(folder))
             shares = divide(scenes, processes)
             self._shares = [np.array(envs) for envs in shares]
             self._rows = [consecutive(envs) for envs in self._shares]
@@ -148,16 +150,24 @@ class BulletSimulation(HostSimulation):
         return found
 
 
-def export_robots(scenes: Sequence[Scene], folder: Path) -> list[ExportedRobot]:
-    """Write the URDF of every robot in the scenes once; return what each scene loads."""
-    written: dict[int, ExportedRobot] = {}
-    for scene in scenes:
-        key = id(scene.robot)
-        if key not in written:
-            merged = merge_rigid_links(scene.robot)
+def export_scenes(scenes: Sequence[Scene], folder: Path) -> list[Exported]:
+    """Write the URDF of every robot and object once; return what each scene loads."""
+    written: dict[int, tuple[Path, Robot]] = {}
+
+    def export(robot: Robot) -> tuple[Path, Robot]:
+        if id(robot) not in written:
+            merged = merge_rigid_links(robot)
             bundle = write_bundle(merged, folder / f"robot{len(written)}", picture=False)
-            written[key] = bundle / URDF, merged
-    return [written[id(scene.robot)] for scene in scenes]
+            written[id(robot)] = bundle / URDF, merged
+        return written[id(robot)]
+
+    return [
+        Exported(
+            *export(scene.robot),
+            export(scene.object.body)[0] if isinstance(scene.object, ArticulatedObject) else None,
+        )
+        for scene in scenes
+    ]
 
 
 def divide(scenes: Sequence[Scene], processes: int) -> list[list[int]]:

@@ -25,6 +25,7 @@ from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Robot
 from morphgen.model.tree import rigid_groups
 from morphgen.processes import sigint_blocked
+from morphgen.tasks.sim.articulated import ArticulatedObject, ObjectJoints
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.motor_law import GAIN, clamp, constant, farthest_targets, is_within
 from morphgen.tasks.sim.rigid_bodies import ground_contact_links
@@ -56,8 +57,23 @@ millimetre of their positions after all iterations, in half of the time."""
 OVERSPEED = 1.5
 """Largest speed of joints under contact, relative to the robot's fastest joint. If a joint has no
 speed limit, all joints of the robot get PyBullet's limit, 100 rad/s or m/s."""
-_LINKS, _ROOT, _STATIC, _BLOCK = 1, 2, 4, 8
-"""Collision groups: movable links, fixed links, ground and obstacles, block."""
+_LINKS, _ROOT, _STATIC, _BLOCK, _ARTICULATED = 1, 2, 4, 8, 16
+"""Collision groups: movable links, fixed links, ground and obstacles, block, and the links of an
+articulated object."""
+
+
+_MOVABLE = (pybullet.JOINT_REVOLUTE, pybullet.JOINT_PRISMATIC)
+_FROM_BULLET, _TO_BULLET = [0, 1, 2, 6, 3, 4, 5], [0, 1, 2, 4, 5, 6, 3]
+"""Columns of a pose in morphgen's order, and in PyBullet's, whose quaternions have w last."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """Files of a scene, which PyBullet loads."""
+
+    urdf: Path  # the robot, with rigid links merged
+    merged: Robot  # that robot
+    object_urdf: Path | None  # the articulated object, if the scene has one
 
 
 SLACK = 0.2
@@ -199,7 +215,7 @@ class BulletScene:
     the same bits as a fresh one.
     """
 
-    def __init__(self, scene: Scene, urdf: Path, merged: Robot, contacts: Contacts) -> None:
+    def __init__(self, scene: Scene, exported: Exported, contacts: Contacts) -> None:
         """Load the robot and its surroundings."""
         self._scene, self._contacts = scene, contacts
         self.id: int = pybullet.connect(pybullet.DIRECT)
@@ -219,12 +235,15 @@ class BulletScene:
                 deterministicOverlappingPairs=1,
                 enableConeFriction=1,
                 useSplitImpulse=0,
-                **({"constraintSolverType": direct} if scene.block is None else {}),
+                **({"constraintSolverType": direct} if scene.object is None else {}),
                 **self._client,
             )
         self._groups: list[tuple[int, int, int, int]] = []
-        self._load_robot(urdf, merged)
+        self._load_robot(exported.urdf, exported.merged)
         self._load_surroundings()
+        self.object_joint: int | None = None
+        if isinstance(scene.object, ArticulatedObject):
+            self._load_articulated(scene.object, exported.object_urdf)
 
     def _load_robot(self, urdf: Path, merged: Robot) -> None:
         """Load the robot, and set its contacts, friction, damping and speed limit."""
@@ -298,6 +317,40 @@ class BulletScene:
             self.block = self._add(self._box(block), block.friction, _BLOCK)
             self._weight = (0.0, 0.0, -GRAVITY * block.mass)
 
+    def _load_articulated(self, thing: ArticulatedObject, urdf: Path | None) -> None:
+        """Load an articulated object, whose dry friction is a motor that wants to stand still."""
+        with quiet():
+            self.object: int = pybullet.loadURDF(
+                str(urdf),
+                *_pose(thing.pose),
+                useFixedBase=True,
+                flags=pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_IMPLICIT_CYLINDER,
+                **self._client,
+            )
+        self._object_joints = ObjectJoints([thing])
+        for i in range(-1, pybullet.getNumJoints(self.object, **self._client)):
+            pybullet.changeDynamics(
+                self.object,
+                i,
+                lateralFriction=thing.friction,
+                linearDamping=0,
+                angularDamping=0,
+                **self._client,
+            )
+            self._assign(self.object, i, _ARTICULATED)
+            if i >= 0 and pybullet.getJointInfo(self.object, i, **self._client)[2] in _MOVABLE:
+                self.object_joint = i
+        pybullet.changeDynamics(
+            self.object, self.object_joint, jointDamping=thing.joint.damping, **self._client
+        )
+        pybullet.setJointMotorControl2(
+            self.object,
+            self.object_joint,
+            pybullet.VELOCITY_CONTROL,
+            force=thing.joint.friction,
+            **self._client,
+        )
+
     def _box(self, block: Block) -> int:
         """Add a box; return PyBullet's body."""
         half = [edge / 2 for edge in block.size]
@@ -319,10 +372,11 @@ class BulletScene:
     def _assign(self, body: int, link: int, group: int) -> None:
         """Record a link's collision group and the groups it collides with, for ``reset``."""
         robot = _LINKS | _ROOT
-        surroundings = _STATIC | _BLOCK if self._contacts.scene else 0
+        surroundings = _STATIC | _BLOCK | _ARTICULATED if self._contacts.scene else 0
         mask = {
             _LINKS: robot | surroundings,
-            _ROOT: _LINKS | (surroundings & _BLOCK),
+            _ROOT: _LINKS | (surroundings & (_BLOCK | _ARTICULATED)),
+            _ARTICULATED: robot if self._contacts.scene else 0,
             _STATIC: _BLOCK | (_LINKS if self._contacts.scene else 0),
             _BLOCK: _STATIC | (robot if self._contacts.scene else 0),
         }[group]
@@ -344,6 +398,9 @@ class BulletScene:
             moved.append((self.block, block_pose))
             pybullet.resetBaseVelocity(self.block, (0, 0, 0), (0, 0, 0), **self._client)
             self._block_position = tuple(block_pose[:3])  # where its weight acts in the next step
+        if self.object_joint is not None:
+            position = self._object_joints.positions(np.array([block_pose], np.float64))[0]
+            pybullet.resetJointState(self.object, self.object_joint, position, **self._client)
         for body, (x, y, z, qw, qx, qy, qz) in moved:
             pybullet.resetBasePositionAndOrientation(
                 body, (x, y, z), (qx, qy, qz, qw), **self._client
@@ -382,8 +439,15 @@ class BulletScene:
         )
         return states
 
-    def block_state(self) -> tuple[float, ...]:
-        """Return position, quaternion (x, y, z, w), linear and angular velocity of the block."""
+    def object_state(self) -> tuple[float, ...]:
+        """Return position, quaternion (x, y, z, w), linear and angular velocity of the object.
+
+        An articulated object has one velocity, that of its joint, which comes last.
+        """
+        if self.object_joint is not None:
+            q, qd, *_ = pybullet.getJointState(self.object, self.object_joint, **self._client)
+            pose = self._object_joints.poses(np.array([q]))[0, _TO_BULLET]
+            return (*pose.tolist(), *(0.0,) * 5, qd)
         position, quaternion = pybullet.getBasePositionAndOrientation(self.block, **self._client)
         linear, angular = pybullet.getBaseVelocity(self.block, **self._client)
         self._block_position = position
@@ -412,10 +476,7 @@ MAX_VELOCITY = 1e4
 """Speed of joints and blocks [rad/s or m/s] and distance of blocks [m] that count as diverged."""
 MAX_POSITION = float(np.finfo(np.float32).max)
 """Joint positions may be any finite number: continuous joints turn without end."""
-_FROM_BULLET = [0, 1, 2, 6, 3, 4, 5]
-"""Columns of a pose in morphgen's order: PyBullet's quaternions have w last."""
 Float32 = NDArray[np.float32]
-ExportedRobot = tuple[Path, Robot]  # URDF of a robot whose rigid links are merged, and that robot
 State = tuple[Float32, Float32, Float32, Float32]
 """Joint positions and velocities, poses and linear velocities of blocks, a row per scene."""
 
@@ -426,7 +487,7 @@ class Share:
 
     scenes: Sequence[Scene]
     contacts: Contacts  # pairs of things that collide
-    exported: Sequence[ExportedRobot]  # robot of each scene, as `export_robots` wrote it
+    exported: Sequence[Exported]  # robot and object of each scene, as `export_scenes` wrote them
     num_joints: int  # length of the rows of joints in all processes
 
 
@@ -458,14 +519,13 @@ class BulletBatch:
         except BaseException:
             self.close()
             raise
-        self._blocks = [i for i, scene in enumerate(self._scenes) if scene.block is not None]
+        self._objects = [i for i, scene in enumerate(self._scenes) if scene.object is not None]
         self._index_joints()
         efforts = [effort for loaded in self._loaded for effort in loaded.efforts]
         self._forces = MotorForces([scene.robot for scene in self._scenes], efforts)
 
     def _load(self, i: int) -> BulletScene:
-        urdf, merged = self._share.exported[i]
-        return BulletScene(self._scenes[i], urdf, merged, self._share.contacts)
+        return BulletScene(self._scenes[i], self._share.exported[i], self._share.contacts)
 
     def _index_joints(self) -> None:
         """Index targets and states in flat arrays of all scenes' joints.
@@ -528,8 +588,8 @@ class BulletBatch:
             self._velocities[span], self._measured[span] = 0, 0
             loaded.reset(self._positions[span].tolist(), pose.tolist(), self._obstacle_poses[i])
             all_q[i], all_qd[i] = positions, 0
-            if scene.block is not None:
-                poses[i] = np.array(loaded.block_state()[:7])[_FROM_BULLET]
+            if scene.object is not None:
+                poses[i] = np.array(loaded.object_state()[:7])[_FROM_BULLET]
                 velocities[i] = 0
 
     def step(self, targets: Array) -> dict[int, str]:
@@ -558,10 +618,10 @@ class BulletBatch:
         q, qd = self._positions[self._independent], self._measured[self._independent]
         self._flat_q[self._sink], self._flat_qd[self._sink] = q, qd
         is_sane = is_within(q, MAX_POSITION) and is_within(qd, MAX_VELOCITY)
-        if self._blocks:
-            blocks = np.array([self._loaded[i].block_state() for i in self._blocks])
-            self.state[2][self._blocks] = blocks[:, _FROM_BULLET]
-            self.state[3][self._blocks] = blocks[:, 7:10]
+        if self._objects:
+            blocks = np.array([self._loaded[i].object_state() for i in self._objects])
+            self.state[2][self._objects] = blocks[:, _FROM_BULLET]
+            self.state[3][self._objects] = blocks[:, 7:10]
             is_sane = is_sane and is_within(blocks, MAX_VELOCITY)
         return {} if is_sane else self._find_diverged()
 
@@ -589,7 +649,7 @@ class BulletBatch:
         """Return the states of scenes that diverged."""
         faults = {}
         for i, (q, qd, pose, _) in enumerate(zip(*self.state, strict=True)):
-            block = np.array(self._loaded[i].block_state() if i in self._blocks else [0.0])
+            block = np.array(self._loaded[i].object_state() if i in self._objects else [0.0])
             joints = is_within(q, MAX_POSITION) and is_within(qd, MAX_VELOCITY)
             if not (joints and is_within(block, MAX_VELOCITY)):
                 faults[i] = f"q {q.tolist()}, qd {qd.tolist()}, block {pose.tolist()}"

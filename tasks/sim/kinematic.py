@@ -53,8 +53,8 @@ class KinematicSimulation(Simulation):
                 f"simulator 'kinematic' has no contacts: {contacts}; expected {NO_CONTACTS}"
             )
         for env, scene in enumerate(scenes):
-            if scene.block is not None or scene.obstacles:
-                thing = "a block" if scene.block is not None else "obstacles"
+            if scene.object is not None or scene.obstacles:
+                thing = "an object" if scene.object is not None else "obstacles"
                 raise SimulationError(
                     f"{self._label(env)}: the scene has {thing}, and simulator 'kinematic' has no "
                     "contacts; expected another simulator"

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from morphgen.errors import SimulationError
 from morphgen.formats.mjcf.write import to_spec
 from morphgen.model.dynamics import armature, movable_mass_matrix
-from morphgen.model.geometry import IDENTITY
+from morphgen.model.geometry import IDENTITY, Box, Capsule, Cylinder, Mesh, Shape, Sphere
 from morphgen.model.robot import Robot
+from morphgen.tasks.sim.articulated import ArticulatedObject
 from morphgen.tasks.sim.base import GRAVITY, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.motor_law import GAIN
 from morphgen.tasks.sim.rigid_bodies import ground_contact_links, merge_rigid_links
@@ -62,6 +63,8 @@ class World:
     qd_at: Indices  # indices in `qvel` of the independent joints
     block_q_at: Indices  # indices in `qpos` of the block's pose, (7,), or none
     block_qd_at: Indices  # indices in `qvel` of the block's linear velocity, (3,), or none
+    object: ArticulatedObject | None
+    object_q_at: Indices  # index in `qpos` of the joint of the articulated object, (1,), or none
     obstacles: Indices  # indices in `mocap_pos` of the obstacles, which are mocap bodies
 
 
@@ -88,9 +91,16 @@ def worlds(scenes: Sequence[Scene], contacts: Contacts) -> list[World]:
     models: dict[object, World] = {}
     compiled = []
     for env, scene in enumerate(scenes):
-        block = replace(scene.block, pose=IDENTITY) if scene.block is not None else None
+        block = scene.block
+        placed = replace(block, pose=IDENTITY) if block is not None else scene.object
         obstacles = tuple(replace(obstacle, pose=IDENTITY) for obstacle in scene.obstacles)
-        key = (id(scene.robot), scene.T_world_root, block, obstacles, scene.ground)
+        key = (
+            id(scene.robot),
+            scene.T_world_root,
+            placed if block is not None else id(placed),
+            obstacles,
+            scene.ground,
+        )
         if key not in models:
             if id(scene.robot) not in specs:
                 specs[id(scene.robot)] = _robot_spec(scene.robot, contacts)
@@ -156,7 +166,7 @@ def _missing_inertia(robot: Robot) -> Array:
 
 
 def _world(scene: Scene, robot: Robot, spec: mujoco.MjSpec) -> World:
-    """Add ground, obstacles and block to a robot's spec, and compile it."""
+    """Add ground, obstacles and object to a robot's spec, and compile it."""
     root = spec.body(robot.root.name)
     root.pos, root.quat = scene.T_world_root.position, scene.T_world_root.quaternion
     for name in ground_contact_links(robot, scene.T_world_root) - {robot.root.name}:
@@ -173,15 +183,18 @@ def _world(scene: Scene, robot: Robot, spec: mujoco.MjSpec) -> World:
         obstacles[-1].pos, obstacles[-1].quat = obstacle.pose.position, obstacle.pose.quaternion
         geom = _add_box(obstacles[-1], obstacle, _OBSTACLE_PRIORITY)
         geom.contype, geom.conaffinity = _BY_SCENE | _BY_BLOCK, 0
+    thing = scene.object if isinstance(scene.object, ArticulatedObject) else None
     if scene.block is not None:
         _add_block(spec, scene.block)
+    if thing is not None:
+        _add_articulated(spec, thing)
     model = spec.compile()
 
     def at(joints: Iterable[int], attribute: str) -> Indices:
         each = (getattr(model.joint(robot.joints[k].name), attribute)[0] for k in joints)
         return np.array([*each], dtype=np.int64)
 
-    # The block's joint is the last one of the model.
+    # The object's joint is the last one of the model.
     pose = np.arange(7 if scene.block is not None else 0)
     return World(
         robot,
@@ -192,6 +205,8 @@ def _world(scene: Scene, robot: Robot, spec: mujoco.MjSpec) -> World:
         qd_at=at(robot.independent_joints, "dofadr"),
         block_q_at=model.nq - len(pose) + pose,
         block_qd_at=model.nv - 6 + pose[:3],
+        object=thing,
+        object_q_at=np.arange(model.nq - (thing is not None), model.nq),
         obstacles=model.body_mocapid[[obstacle.id for obstacle in obstacles]].astype(np.int64),
     )
 
@@ -207,6 +222,51 @@ def _add_block(spec: mujoco.MjSpec, block: Block) -> None:
     geom = _add_box(body, block, _BLOCK_PRIORITY)
     geom.contype, geom.conaffinity = _BY_SCENE, _BY_BLOCK
     geom.solimp, geom.margin = BLOCK_IMPEDANCE, BLOCK_MARGIN
+
+
+def _add_articulated(spec: mujoco.MjSpec, thing: ArticulatedObject) -> None:
+    """Add an articulated object; it collides with links of the robot alone."""
+    base = spec.worldbody.add_body()
+    base.pos, base.quat = thing.pose.position, thing.pose.quaternion
+    joint = thing.joint
+    link = base.add_body()
+    link.pos, link.quat = joint.T_parent_joint.position, joint.T_parent_joint.quaternion
+    inertial = thing.moving_inertial
+    assert inertial is not None
+    link.gravcomp = 1.0  # as links of robots
+    link.explicitinertial = True
+    link.mass, link.ipos = inertial.mass, inertial.com
+    xx, xy, xz, yy, yz, zz = inertial.inertia
+    link.fullinertia = [xx, yy, zz, xy, xz, yz]  # MuJoCo's order
+    is_slide = joint.kind == "prismatic"
+    kind = mujoco.mjtJoint.mjJNT_SLIDE if is_slide else mujoco.mjtJoint.mjJNT_HINGE
+    moved = link.add_joint(type=kind, axis=joint.unit_axis)
+    moved.damping[0], moved.frictionloss = joint.damping, joint.friction
+    if joint.limits is not None and not joint.is_continuous:
+        moved.limited, moved.range = mujoco.mjtLimited.mjLIMITED_TRUE, joint.limits
+    for body, shapes in ((base, thing.base_shapes), (link, thing.moving_shapes)):
+        for shape in shapes:
+            geom = add_shape(body, shape)
+            geom.priority, geom.friction[0] = _BLOCK_PRIORITY, thing.friction
+            geom.contype, geom.conaffinity = _BY_SCENE, 0
+
+
+def add_shape(body: mujoco.MjsBody, shape: Shape) -> mujoco.MjsGeom:
+    """Add a primitive shape to a body."""
+    kinds = mujoco.mjtGeom
+    match shape.geometry:
+        case Box((x, y, z)):
+            geom = body.add_geom(type=kinds.mjGEOM_BOX, size=[x / 2, y / 2, z / 2])
+        case Sphere(radius):
+            geom = body.add_geom(type=kinds.mjGEOM_SPHERE, size=[radius, 0, 0])
+        case Cylinder(radius, length):
+            geom = body.add_geom(type=kinds.mjGEOM_CYLINDER, size=[radius, length / 2, 0])
+        case Capsule(radius, length):
+            geom = body.add_geom(type=kinds.mjGEOM_CAPSULE, size=[radius, length / 2, 0])
+        case Mesh():
+            raise TypeError(f"{shape.geometry.path}: a mesh is no primitive shape")
+    geom.pos, geom.quat = shape.T_link_shape.position, shape.T_link_shape.quaternion
+    return geom
 
 
 def _add_box(body: mujoco.MjsBody, block: Block, priority: int) -> mujoco.MjsGeom:

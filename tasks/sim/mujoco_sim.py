@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from morphgen.formats.quiet import MujocoWarnings
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.kinematics import movable_positions
+from morphgen.tasks.sim.articulated import ObjectJoints
 from morphgen.tasks.sim.base import (
     CONTROL_PERIOD,
     SUBSTEPS,
@@ -84,6 +85,10 @@ class MujocoState:
             if len(world.block_q_at):
                 self._pose_at[i] = begin[i] + world.block_q_at
                 self._velocity_at[i] = begin[n + i] + world.block_qd_at
+        objects = {i: world.object for i, world in enumerate(worlds) if world.object is not None}
+        self._articulated = [*objects]
+        self._object_at = [begin[i] + worlds[i].object_q_at[0] for i in objects]
+        self._object_joints = ObjectJoints([*objects.values()]) if objects else None
         self._has_blocks = bool((self._pose_at >= 0).any())
         self._joints = np.zeros((2, n, joints), np.float32)
         self._block_pose = np.zeros((n, 7), np.float32)
@@ -107,6 +112,9 @@ class MujocoState:
             quaternion = pose[:, 3:]
             quaternion *= np.where(quaternion[:, :1] < 0, -1.0, 1.0)  # w >= 0, as everywhere
             self._block_pose[:] = pose
+        if self._object_joints is not None:
+            positions = self._numbers.flat[self._object_at]
+            self._block_pose[self._articulated] = self._object_joints.poses(positions)
 
     def faults(self) -> dict[int, str]:
         """Return the environments that diverged up to the last ``read``, each with the reason."""
@@ -304,6 +312,9 @@ class MujocoSimulation(HostSimulation):
                         f"{self._label(env)}: {pose.tolist()} is not a pose of a block"
                     )
                 data.qpos[world.block_q_at] = pose
+            if world.object is not None:
+                pose = block_pose[row : row + 1].astype(np.float64)
+                data.qpos[world.object_q_at] = ObjectJoints([world.object]).positions(pose)
             mujoco.mj_kinematics(world.model, data)  # these three give the inertia of controls
             mujoco.mj_comPos(world.model, data)
             mujoco.mj_makeM(world.model, data)

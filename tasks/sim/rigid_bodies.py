@@ -65,7 +65,7 @@ def merge_rigid_links(robot: Robot) -> Robot:
     links = tuple(
         Link(
             name,
-            _merged_inertial(parts),
+            merged_inertial(parts),
             collisions=tuple(
                 replace(shape, T_link_shape=T @ shape.T_link_shape)
                 for T, link in parts
@@ -82,7 +82,7 @@ def merge_rigid_links(robot: Robot) -> Robot:
     return rename(merged, names) if merged.root.name == "world" else merged
 
 
-def _merged_inertial(pieces: list[_Piece]) -> Inertial | None:
+def merged_inertial(pieces: list[_Piece]) -> Inertial | None:
     """Add masses, and inertias about the common centre of mass (parallel axis theorem)."""
     massive = [
         (T.matrix, link.inertial)

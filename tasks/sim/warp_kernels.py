@@ -37,6 +37,12 @@ class Joints:
     """Largest distance between a target and its joint, (R, J) [rad or m]."""
     block_q_at: int  # first index in `qpos` of the block's pose, or -1
     block_qd_at: int  # first index in `qvel` of its linear velocity
+    object_q_at: int  # index in `qpos` of the joint of an articulated object, or -1
+    object_is_slide: int  # whether it is prismatic
+    object_frame: wp.array2d[float]
+    """Pose in the world of the joint's frame at zero: x, y, z, qw, qx, qy, qz, (R, 7)."""
+    object_axis: wp.array2d[float]
+    """Axis of the joint in the world, then in its own frame, (R, 6)."""
     obstacles: wp.array[int]  # indices in `mocap_pos` of the obstacles
 
 
@@ -112,6 +118,18 @@ def controls(
     )
 
 
+@wp.func
+def _object(joints: Joints, row: int) -> tuple[wp.vec3, wp.quat, wp.vec3, wp.vec3]:
+    """Return origin and rotation of an object's joint at zero, and its axis in world and joint."""
+    frame, axes = joints.object_frame[row], joints.object_axis[row]
+    return (
+        wp.vec3(frame[0], frame[1], frame[2]),
+        wp.quat(frame[4], frame[5], frame[6], frame[3]),
+        wp.vec3(axes[0], axes[1], axes[2]),
+        wp.vec3(axes[3], axes[4], axes[5]),
+    )
+
+
 @wp.kernel
 def read_state(
     joints: Joints,
@@ -131,6 +149,21 @@ def read_state(
     for joint in range(joints.q_at.shape[0]):
         out_q[env, joint] = qpos[world, joints.q_at[joint]]
         out_qd[env, joint] = qvel[world, joints.qd_at[joint]]
+    if joints.object_q_at >= 0:
+        row = world % joints.object_frame.shape[0]
+        position = qpos[world, joints.object_q_at]
+        origin, turn, direction, axis = _object(joints, row)
+        if joints.object_is_slide == 1:
+            origin = origin + position * direction
+        else:
+            half = wp.sin(position / 2.0)
+            moved = wp.quat(half * axis[0], half * axis[1], half * axis[2], wp.cos(position / 2.0))
+            turn = turn * moved
+        side = wp.where(turn[3] < 0.0, -1.0, 1.0)
+        out_pose[env, 3] = side * turn[3]
+        for k in range(3):
+            out_pose[env, k] = origin[k]
+            out_pose[env, k + 4] = side * turn[k]
     if joints.block_q_at >= 0:
         sign = wp.where(qpos[world, joints.block_q_at + 3] < 0.0, -1.0, 1.0)  # qw >= 0
         for k in range(3):
@@ -214,6 +247,15 @@ def reset_worlds(
     if joints.block_q_at >= 0:
         for k in range(7):
             qpos[world, joints.block_q_at + k] = block_pose[env, k]
+    if joints.object_q_at >= 0:
+        origin, turn, direction, axis = _object(joints, world % joints.object_frame.shape[0])
+        pose = block_pose[env]
+        moved = wp.quat_inverse(turn) * wp.quat(pose[4], pose[5], pose[6], pose[3])
+        along = wp.dot(wp.vec3(pose[0], pose[1], pose[2]) - origin, direction)
+        angle = 2.0 * wp.atan2(wp.dot(wp.vec3(moved[0], moved[1], moved[2]), axis), moved[3])
+        angle = wp.where(angle > wp.pi, angle - 2.0 * wp.pi, angle)
+        angle = wp.where(angle < -wp.pi, angle + 2.0 * wp.pi, angle)
+        qpos[world, joints.object_q_at] = wp.where(joints.object_is_slide == 1, along, angle)
     if obstacle_poses.shape[1] > 0:
         for k in range(joints.obstacles.shape[0]):
             pose = obstacle_poses[env, k]

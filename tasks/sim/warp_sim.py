@@ -29,6 +29,7 @@ except ModuleNotFoundError as error:
     ) from error
 
 from morphgen.tasks.sim import warp_kernels as kernels
+from morphgen.tasks.sim.articulated import ObjectJoints
 from morphgen.tasks.sim.base import SUBSTEPS, Contacts, Scene, Simulation, Simulator
 from morphgen.tasks.sim.motor_law import farthest_targets
 from morphgen.tasks.sim.mujoco_model import World, worlds
@@ -230,7 +231,15 @@ def _equal(a: Any, b: Any) -> bool:  # noqa: ANN401  # fields of any type
 
 def _same_indices(first: World, other: World) -> bool:
     """Return whether two worlds have joints, block and obstacles at the same indices."""
-    names = ("q_at", "qd_at", "movable_q_at", "movable_qd_at", "obstacles", "block_q_at")
+    names = (
+        "q_at",
+        "qd_at",
+        "movable_q_at",
+        "movable_qd_at",
+        "obstacles",
+        "block_q_at",
+        "object_q_at",
+    )
     return all(
         np.array_equal(getattr(first, name), getattr(other, name)) for name in names
     ) and np.array_equal(dof_leaders(first)[0], dof_leaders(other)[0])
@@ -287,7 +296,8 @@ class Group:
         model = first.model
         count = len(structure.envs)
         contact_rows = 3 * max_contacts(model.ngeom)  # a normal and two tangents
-        rows = int(model.neq + np.count_nonzero(model.jnt_limited) + contact_rows)
+        limited = np.count_nonzero(model.jnt_limited) + np.count_nonzero(model.dof_frictionloss)
+        rows = int(model.neq + limited + contact_rows)
         with wp.ScopedDevice(device):
             self.model = put_model(structure, device)
             self.data = mujoco_warp.make_data(
@@ -413,6 +423,13 @@ def _joints(structure: Structure) -> kernels.Joints:
     has_block = len(first.block_q_at) > 0
     joints.block_q_at = int(first.block_q_at[0]) if has_block else -1
     joints.block_qd_at = int(first.block_qd_at[0]) if has_block else 0
+    objects = [world.object for world in rows if world.object is not None]
+    joints.object_q_at = int(first.object_q_at[0]) if objects else -1
+    if objects:
+        moved = ObjectJoints(objects)
+        joints.object_is_slide = int(moved.is_slide[0])
+        joints.object_frame = _array(moved.frame, float)
+        joints.object_axis = _array(np.hstack([moved.direction, moved.axis]), float)
     joints.obstacles = _array(first.obstacles, int)
     return joints
 

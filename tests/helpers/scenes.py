@@ -49,7 +49,7 @@ def push_scene(mass=0.1, friction=1.0):
     edge = 0.15
     return Scene(
         robot("prims"),
-        block=Block((edge, edge, edge), Pose((0.0, 0.0, edge / 2)), mass, friction),
+        object=Block((edge, edge, edge), Pose((0.0, 0.0, edge / 2)), mass, friction),
         obstacles=(
             Block((0.1, 0.1, 0.1), Pose((0.5, 0.2, 0.05))),
             Block((0.1, 0.1, 0.2), Pose.from_xyz_rpy((-0.5, 0.2, 0.1), (0.0, 0.0, 0.5))),

@@ -37,7 +37,7 @@ NO_GOALS = np.zeros((0, 2))
 
 def space_of(*walls):
     """Free space of a ball of 0.1 m on slides along x and y, with a block and walls."""
-    return FreeSpace(Scene(ball(0.2), block=Block((0.1, 0.1, 0.1)), obstacles=walls))
+    return FreeSpace(Scene(ball(0.2), object=Block((0.1, 0.1, 0.1)), obstacles=walls))
 
 
 def planner_of(*walls):

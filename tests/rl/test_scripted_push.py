@@ -119,7 +119,7 @@ def test_contacts_are_found_where_the_robot_touches_the_block():
     q = np.array([[0.0, -0.5], [0.1, -0.5], [1.5, -0.5]])
 
     def found(height):
-        scene = Scene(ball(height), block=Block((0.4, 0.4, 0.4)), ground=None)
+        scene = Scene(ball(height), object=Block((0.4, 0.4, 0.4)), ground=None)
         return find_contacts(FreeSpace(scene), q, block, 0.4)
 
     low = found(0.2)
@@ -134,7 +134,7 @@ def test_contacts_are_found_where_the_robot_touches_the_block():
 def test_the_contact_of_a_plate_is_as_wide_as_the_plate():
     plate = Link("ball", collisions=(Shape(Box((0.8, 0.02, 0.3))),))
     wide = ball(0.2).with_links([plate])
-    scene = Scene(wide, block=Block((0.4, 0.4, 0.4)), ground=None)
+    scene = Scene(wide, object=Block((0.4, 0.4, 0.4)), ground=None)
     block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
     found = find_contacts(FreeSpace(scene), np.array([[0.0, -0.5]]), block, 0.4)
     assert found.width[0] == 1
@@ -146,7 +146,7 @@ def test_the_overhang_of_a_brim_is_its_lead(ahead, over):
     foot = Shape(Box((0.2, 0.1, 0.1)))
     brim = Shape(Box((0.2, 0.1, 0.02)), Pose((0.0, ahead, 0.3)))
     wide = ball(0.1).with_links([Link("ball", collisions=(foot, brim))])
-    scene = Scene(wide, block=Block((0.4, 0.4, 0.4)), ground=None)
+    scene = Scene(wide, object=Block((0.4, 0.4, 0.4)), ground=None)
     block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
     found = find_contacts(FreeSpace(scene), np.array([[0.0, -0.5]]), block, 0.4)
     assert found.gap[0] == pytest.approx(0.25 - max(ahead, 0), abs=0.002)

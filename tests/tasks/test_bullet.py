@@ -135,7 +135,7 @@ def test_joints_return_to_their_limits(simulate, pushes):
     """Joints return whatever pushed them; scenes with a block use another solver."""
     body = arm()
     block = Block((0.1, 0.1, 0.1), Pose((3.0, 0.0, 0.05)), 1.0) if pushes else None
-    simulation = simulate(Scene(body, Pose((0.0, 0.0, 1.0)), block=block))
+    simulation = simulate(Scene(body, Pose((0.0, 0.0, 1.0)), object=block))
     q = reset(simulation, [1.95, 0.0, 0.0, 0.0])
     loaded = client_of(simulation)
     link = loaded.driven[0]
@@ -213,7 +213,7 @@ def test_fixed_base_touches_blocks_but_not_static_objects(simulate):
     """The arm's base overlaps the ground and a box, and touches a block."""
     box = Block((0.1, 0.1, 0.05), Pose((0.0, 0.0, -0.01)))
     scene = Scene(robot("arm=ur5 ee=plane"), obstacles=(box,))
-    simulation = simulate(scene, replace(scene, block=replace(box, mass=0.1), obstacles=()))
+    simulation = simulate(scene, replace(scene, object=replace(box, mass=0.1), obstacles=()))
     q = reset(simulation)
     simulation.step(q)
     assert touching(simulation) == set()
@@ -327,7 +327,7 @@ def test_diverged_environments_are_reported_and_the_others_step(heavy):
     """The block's weight is not finite."""
     scenes = [push_scene() for _ in range(4)]
     for env in heavy:
-        scenes[env] = Scene(push_scene().robot, block=Block((0.1, 0.1, 0.1), mass=1e308))
+        scenes[env] = Scene(push_scene().robot, object=Block((0.1, 0.1, 0.1), mass=1e308))
     with closing(BulletSimulation(scenes, processes=2)) as simulation:
         assert [share.tolist() for share in simulation._shares] == [[0, 2], [1, 3]]
         q = reset(simulation)
@@ -343,12 +343,13 @@ def test_diverged_environments_are_reported_and_the_others_step(heavy):
 
 
 def test_robot_that_cannot_be_loaded_is_named_in_the_parent(monkeypatch, scratch):
-    original = bullet.export_robots
+    original = bullet.export_scenes
 
     def lost(scenes, folder):
-        return [(path.with_name("none.urdf"), body) for path, body in original(scenes, folder)]
+        exported = original(scenes, folder)
+        return [replace(each, urdf=each.urdf.with_name("none.urdf")) for each in exported]
 
-    monkeypatch.setattr(bullet, "export_robots", lost)
+    monkeypatch.setattr(bullet, "export_scenes", lost)
     with pytest.raises(SimulationError, match="robot 'prims': PyBullet cannot load it"):
         BulletSimulation([push_scene()])
     assert leftovers(scratch, os.getpid()) == []

@@ -91,7 +91,7 @@ HIGH_SLAB, THIN = (
         (Scene(pointing(-0.3), obstacles=(THIN,)), {-0.25: True}),
         (Scene(aside(), HALF_TURN), {0.0: True, 0.5: False, -0.5: True}),  # the slide points down
         (Scene(aside(), Pose((0.0, 0.0, 1.0))), {0.5: True, -0.5: True}),
-        (Scene(aside(), block=replace(SLAB, mass=0.1)), {0.0: True}),
+        (Scene(aside(), object=replace(SLAB, mass=0.1)), {0.0: True}),
         (Scene(aside(), obstacles=(replace(SLAB, mass=0.1),)), {0.0: False}),
         (
             Scene(named_like_surroundings(), obstacles=(SLAB,)),
@@ -209,7 +209,7 @@ def block_at(x, z, *, yaw=0.0, pitch=0.0):
 
 def pushed(robot=None, **changes):
     block = Block((0.2, 0.2, 0.2), mass=0.1)
-    return FreeSpace(Scene(robot or aside(), block=block, **changes))
+    return FreeSpace(Scene(robot or aside(), object=block, **changes))
 
 
 ABOVE = 0.5 + 0.1 + 0.1

@@ -335,7 +335,7 @@ def sample_starts(words, cache, *, config=PUSH, obstacles=False, seed=0, ground=
 def space_of(words, push_set, layout=None):
     boxes = () if layout is None else place_boxes(push_set.obstacles, push_set.layouts[layout])
     return FreeSpace(
-        Scene(robot(words), block=push_set.block, obstacles=boxes, ground=push_set.ground)
+        Scene(robot(words), object=push_set.block, obstacles=boxes, ground=push_set.ground)
     )
 
 

@@ -166,7 +166,7 @@ def test_joints_without_limits_turn_on():
 
 @pytest.mark.parametrize(
     ("scene", "thing"),
-    [(push_scene(), "a block"), (replace(push_scene(), block=None), "obstacles")],
+    [(push_scene(), "an object"), (replace(push_scene(), object=None), "obstacles")],
 )
 def test_scenes_with_something_to_touch_are_refused(scene, thing):
     with pytest.raises(SimulationError, match=f"environment 1 .*has {thing}"):
@@ -228,7 +228,7 @@ def test_kinematic_is_a_registered_simulator_that_mujoco_judges():
 def test_batches_with_something_to_touch_are_refused(tmp_path):
     body = robot("prims")
     configs = (replace(PushConfig(), num_goals=2), replace(ReachConfig(), num_goals=2))
-    for task, obstacles, thing in (("push", False, "a block"), ("reach", True, "obstacles")):
+    for task, obstacles, thing in (("push", False, "an object"), ("reach", True, "obstacles")):
         with pytest.raises(
             TaskError, match=f"{task} of .* has {thing}; expected simulator .*mujoco"
         ):

@@ -110,7 +110,7 @@ def test_invalid_block_poses_are_rejected(value, words):
 
 def test_equal_scenes_share_one_model():
     scenes = [push_scene(), push_scene(), push_scene(mass=0.2), reach_scene()]
-    moved = replace(scenes[0], block=replace(scenes[0].block, pose=Pose((0.3, 0, 0.1))))
+    moved = replace(scenes[0], object=replace(scenes[0].block, pose=Pose((0.3, 0, 0.1))))
     sim = MujocoSimulation([*scenes, moved])
     models = [id(world.model) for world in sim._worlds]
     assert models[0] == models[1] == models[4]
@@ -121,7 +121,7 @@ def test_equal_scenes_share_one_model():
 def test_full_speed_back_and_forth_is_stable(request_):
     """Strong motors move light links at their effort limits."""
     body = robot(request_)
-    sim = MujocoSimulation([Scene(body, block=Block((0.1,) * 3, Pose((0.4, 0.2, 0.05)), 0.1))])
+    sim = MujocoSimulation([Scene(body, object=Block((0.1,) * 3, Pose((0.4, 0.2, 0.05)), 0.1))])
     rng = np.random.default_rng(3)
     target, limits = np.array(body.home), joint_limits(body)
     for k in range(200):
@@ -163,7 +163,7 @@ def test_joints_with_nearly_one_axis_have_inertia_against_each_other(index):
 
 
 def block_scene(block, **rest):
-    return Scene(robot("prims"), Pose((5.0, 0.0, 0.0)), block=block, **rest)
+    return Scene(robot("prims"), Pose((5.0, 0.0, 0.0)), object=block, **rest)
 
 
 @pytest.mark.parametrize("friction", [0.3, 0.6])

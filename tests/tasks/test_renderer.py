@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from helpers.goal_sets import draw_spec
+from helpers.objects import door
 from helpers.robots import arm
 from morphgen.errors import FormatError
 from morphgen.model.geometry import Pose
@@ -23,6 +24,7 @@ from morphgen.tasks.render.renderer import (
 )
 from morphgen.tasks.scenes.env_specs import load_robot
 from morphgen.tasks.scenes.make import make_batch
+from morphgen.tasks.sim.articulated import ObjectJoints
 from morphgen.tasks.sim.base import Block, Scene
 
 SIZE = (160, 120)
@@ -139,11 +141,20 @@ def test_robot_without_visuals_is_drawn_with_its_collision_shapes(plain):
     robot = arm()
     bare = replace(robot, links=tuple(replace(link, visuals=()) for link in robot.links))
     block = Block((0.2, 0.2, 0.2), Pose((0.2, -0.5, 0.1)), 0.1)
-    still = plain(Scene(bare, block=block, ground=None))
+    still = plain(Scene(bare, object=block, ground=None))
     a, b = (still.frame(RenderState(q)) for q in (robot.home, (-1.0, -0.5, 0.0, 0.0)))
     assert changed(a, b).sum() > 50
     with_block = still.frame(RenderState(robot.home, (0.2, -0.5, 0.1, 1.0, 0.0, 0.0, 0.0)))
     assert changed(a, with_block).sum() > 50
+
+
+def test_articulated_object_is_drawn_where_its_joint_is(plain):
+    thing = door(Pose((0.3, 0.0, 0.0)))
+    drawing, joints = plain(Scene(arm(), object=thing, ground=None)), ObjectJoints([thing])
+    shut, ajar = (
+        drawing.frame(RenderState(arm().home, joints.poses(np.array([q]))[0])) for q in (0.0, 1.0)
+    )
+    assert changed(shut, ajar).sum() > 50
 
 
 def test_closed_renderer_raises_a_clear_error(on, reach):

@@ -73,7 +73,7 @@ def scenes(sim):
     """Three scenes of different robots, one of them with a block and obstacles if there can be."""
     if SIMULATORS[sim].simulates_contacts:
         return mixed_scenes()
-    return [replace(scene, block=None, obstacles=()) for scene in mixed_scenes()]
+    return [replace(scene, object=None, obstacles=()) for scene in mixed_scenes()]
 
 
 def break_physics(sim, env):
@@ -343,7 +343,7 @@ def pushed(load, block_mass, speed, way, finger_mass=2.0):
     """Return the simulation, and rows of the lag of the finger, rise and tilt of the block."""
     block = Block((EDGE, EDGE, EDGE), Pose((0.0, 0.0, EDGE / 2)), block_mass)
     body = replace(finger(finger_mass), home=(-EDGE / 2 - 0.011, 0.3 * EDGE))
-    sim, rows = load(Scene(body, block=block)), []
+    sim, rows = load(Scene(body, object=block)), []
     q = sim.q.clone()
     for _ in range(round((way + 0.004) / speed / CONTROL_PERIOD)):
         q[:, 0] += speed * CONTROL_PERIOD
@@ -399,7 +399,7 @@ def test_turntable_on_the_ground_does_not_disturb_the_arm(load):
     ]
     paths = []
     for contacts in (Contacts(self_collision=False), NOTHING_TOUCHES):
-        sim, path = load(*(Scene(body, block=block) for body in bodies), contacts=contacts), []
+        sim, path = load(*(Scene(body, object=block) for body in bodies), contacts=contacts), []
         turned = sim.q.clone()
         for _ in range(15):
             turned[:, 0] += 0.05
@@ -459,7 +459,7 @@ def test_a_moved_obstacle_gives_the_bits_of_a_loaded_one(load):
     pose = Pose.from_xyz_rpy((0.5, 0.25, 0.125), (0.0, 0.0, 0.5))
     here, there = (Block((0.125, 0.5, 0.25), p) for p in (pose, Pose((0.5, 4.0, 0.125))))
     block = Block((0.125, 0.125, 0.125), Pose((0.25, 0.25, 0.0625)), mass=0.1)
-    scenes = [Scene(robot("cubes"), block=block, obstacles=(box,)) for box in (here, there)]
+    scenes = [Scene(robot("cubes"), object=block, obstacles=(box,)) for box in (here, there)]
     loaded, moved = (load(scene) for scene in scenes)
     row = np.array([*pose.position, *pose.quaternion], np.float32)
     poses, start = torch.from_numpy(row)[None, None], torch.tensor([[0.0, 0.25]])

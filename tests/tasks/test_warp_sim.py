@@ -241,7 +241,7 @@ def test_static_shapes_are_where_each_robot_of_a_structure_has_them():
     """Blocks come to rest on the tops of tables of different heights."""
     heights = (0.2, 0.6, 0.4)
     scenes = [
-        Scene(table(height), block=Block((0.1,) * 3, Pose((0.0, 0.0, height + 0.1)), 0.1))
+        Scene(table(height), object=Block((0.1,) * 3, Pose((0.0, 0.0, height + 0.1)), 0.1))
         for height in heights
     ]
     assert len(structures(scenes, worlds(scenes, Contacts()))) == 1

@@ -1,0 +1,76 @@
+"""Articulated objects shared by the tests of scenes."""
+
+from morphgen.model.geometry import Box, Cylinder, Pose, Shape
+from morphgen.model.robot import Inertial, Joint, Link, Robot
+from morphgen.tasks.sim.articulated import ArticulatedObject
+
+SOLID = (0.01, 0.0, 0.0, 0.01, 0.0, 0.01)
+POST = Shape(Box((0.05, 0.05, 0.4)), Pose((0.4, 0.0, 0.2)))
+"""A part of each object that stands still."""
+
+
+def drawer(pose=Pose()):
+    """A front on a slide along y, which moves by up to 40 cm."""
+    front = (Shape(Box((0.2, 0.02, 0.1))),)
+    joint = Joint(
+        "slide",
+        "prismatic",
+        "case",
+        "front",
+        Pose((0.0, 0.0, 0.2)),
+        axis=(0.0, 1.0, 0.0),
+        limits=(0.0, 0.4),
+        damping=1.0,
+        friction=1.0,
+    )
+    return _object("drawer", joint, front, (0.0, 0.0, 0.0), pose)
+
+
+def door(pose=Pose((-0.2, 0.0, 0.0))):
+    """A panel, which turns about z to either side."""
+    panel = (Shape(Box((0.3, 0.02, 0.2)), Pose((0.15, 0.0, 0.0))),)
+    joint = Joint(
+        "hinge",
+        "revolute",
+        "case",
+        "panel",
+        Pose((0.0, 0.0, 0.2)),
+        axis=(0.0, 0.0, 1.0),
+        limits=(-1.5, 1.5),
+        damping=0.1,
+        friction=0.1,
+    )
+    return _object("door", joint, panel, (0.15, 0.0, 0.0), pose)
+
+
+def rod():
+    """A rod upright on a slide along y."""
+    return Robot(
+        "rod",
+        (
+            Link("base", Inertial(1.0, inertia=SOLID)),
+            Link("tip", Inertial(0.5, inertia=SOLID), collisions=(Shape(Cylinder(0.02, 0.3)),)),
+        ),
+        (
+            Joint(
+                "slide",
+                "prismatic",
+                "base",
+                "tip",
+                Pose((0.0, 0.0, 0.2)),
+                axis=(0.0, 1.0, 0.0),
+                limits=(-0.5, 0.5),
+                effort=100.0,
+                velocity=2.0,
+            ),
+        ),
+        home=(-0.2,),
+    )
+
+
+def _object(name, joint, shapes, com, pose):
+    links = (
+        Link("case", Inertial(1.0, inertia=SOLID), collisions=(POST,)),
+        Link(joint.child, Inertial(0.5, com, SOLID), collisions=shapes),
+    )
+    return ArticulatedObject(Robot(name, links, (joint,), home=(0.0,)), pose)
