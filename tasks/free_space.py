@@ -355,9 +355,10 @@ def _with_surroundings(
 ) -> Robot:
     """Return the robot with ground, obstacles, block and tool point as further links.
 
-    The ground is fixed to the root: links that are fixed to each other are never tested. Obstacles,
-    among them the base of an articulated object, must be tested against the root too, so each is on a virtual slide that stays at zero. The block
-    has virtual joints for every direction.
+    The ground is fixed to the root: links that are fixed to each other are never tested. Obstacles
+    must be tested against the root too, so each is on a virtual slide that stays at zero; so is the
+    base of an articulated object. The block, or the link that moves, has virtual joints for every
+    direction.
     """
     robot = scene.robot
     link_names = {link.name for link in robot.links}

@@ -1,15 +1,16 @@
 """Articulated objects shared by the tests of scenes."""
 
-from morphgen.model.geometry import Box, Cylinder, Pose, Shape
+from morphgen.model.geometry import IDENTITY, Box, Cylinder, Pose, Shape
 from morphgen.model.robot import Inertial, Joint, Link, Robot
 from morphgen.tasks.sim.articulated import ArticulatedObject
 
 SOLID = (0.01, 0.0, 0.0, 0.01, 0.0, 0.01)
+HINGED = Pose((-0.2, 0.0, 0.0))
 POST = Shape(Box((0.05, 0.05, 0.4)), Pose((0.4, 0.0, 0.2)))
 """A part of each object that stands still."""
 
 
-def drawer(pose=Pose()):
+def drawer(pose=IDENTITY):
     """A front on a slide along y, which moves by up to 40 cm."""
     front = (Shape(Box((0.2, 0.02, 0.1))),)
     joint = Joint(
@@ -26,7 +27,7 @@ def drawer(pose=Pose()):
     return _object("drawer", joint, front, (0.0, 0.0, 0.0), pose)
 
 
-def door(pose=Pose((-0.2, 0.0, 0.0))):
+def door(pose=HINGED):
     """A panel, which turns about z to either side."""
     panel = (Shape(Box((0.3, 0.02, 0.2)), Pose((0.15, 0.0, 0.0))),)
     joint = Joint(
