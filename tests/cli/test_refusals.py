@@ -207,6 +207,8 @@ train interpolation/arm3/reach --obstacles => --obstacles is for one robot
 train interpolation/arm3/reach --envs 9 => fewer than the 10 robots
 RUN --agent me-tff => did you mean 'me-tf'?
 RUN --agent se+magic => after se come switches
+RUN --steps 1e99 => --steps 1.00e+99: expected at most
+RUN --seed 1e99 => (1.16e+77), the largest whole number that a checkpoint can hold
 RUN --steps 31 => an update takes 32 transitions
 RUN --device tpu => unknown device 'tpu'
 RUN --set gama=1 => did you mean 'gamma'?
