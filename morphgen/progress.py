@@ -10,6 +10,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
+from dataclasses import dataclass
 from threading import current_thread, main_thread
 from typing import Protocol, runtime_checkable
 
@@ -82,17 +83,33 @@ def own_progress() -> Iterator[Progress]:
         yield listener or _ignore
 
 
-@contextmanager
-def part_of(total: int | None, first: int = 0) -> Iterator[None]:
-    """Count the items of this block from ``first`` on, of a total of all blocks."""
-    listener = _listener.get()
+@dataclass(frozen=True)
+class _Part:
+    """Counts items as a part of the work that another listener shows; see ``part_of``."""
 
-    def show(done: float, _: int | None) -> None:
-        if listener is not None:
-            listener(first + done, total)
+    listener: Progress | None
+    total: int | None
+    first: int
 
-    with show_progress(show):
-        yield
+    def __call__(self, done: float, _: int | None) -> None:
+        if self.listener is not None:
+            self.listener(self.first + done, self.total)
+
+    def stage(self, title: str) -> AbstractContextManager[None]:
+        """Show the reports of a block as a stage, which counts other items."""
+        if isinstance(self.listener, StagedProgress):
+            return self.listener.stage(title)
+        return show_progress(self.listener)
+
+    def note(self, text: str) -> None:
+        """Show a line."""
+        with show_progress(self.listener):
+            note(text)
+
+
+def part_of(total: int | None, first: int = 0) -> AbstractContextManager[None]:
+    """Count the items of a block from ``first`` on, of a total of all blocks."""
+    return show_progress(_Part(_listener.get(), total, first))
 
 
 def stage(title: str) -> AbstractContextManager[None]:

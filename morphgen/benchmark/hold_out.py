@@ -37,7 +37,7 @@ from morphgen.grammar.manifest import PART_KINDS, Manifest, Parameter, parse_val
 from morphgen.grammar.request import dotted_keys
 from morphgen.model.findings import Finding
 from morphgen.processes import parallel_map
-from morphgen.progress import part_of
+from morphgen.progress import part_of, report, stage
 from morphgen.splits.candidates import (
     Candidate,
     DerivedRecipe,
@@ -305,12 +305,22 @@ def _from_patterns(
 def _from_grammars(
     request: SplitRequest, maker: _DraftMaker, grammars: Sequence[Grammar]
 ) -> Iterator[_Draft]:
-    for grammar in grammars:
+    num_draws = max(MAX_DRAWS, 4 * (max(request.train) + request.test))  # many repeat
+    for i, grammar in enumerate(grammars):
         stream = RobotStream.of(grammar, grammar.name, request)
-        for number in range(max(MAX_DRAWS, 4 * (max(request.train) + request.test))):  # many repeat
+        known: set[str] = set()
+        num_repeated = 0  # draws since the last new derivation
+        for number in range(num_draws):
+            report(i * num_draws + number, len(grammars) * num_draws)
             derivation = stream.derivation(number, maker.library)
-            if derivation is not None:
+            if derivation is not None and (text := str(derivation)) not in known:
+                known.add(text)
+                num_repeated = 0
                 yield maker.draft(stream.recipe(number), derivation)
+                continue
+            num_repeated += 1
+            if num_repeated == MAX_DRAWS:  # the grammar has hardly any others
+                break
 
 
 @dataclass(frozen=True)
@@ -701,7 +711,8 @@ def hold_out(
         patterns = (DEFAULT_PATTERN,)
     maker = _DraftMaker(rules, library, request.seed)
     factory = RobotFactory(library, with_features=True, max_links=request.max_links)
-    pool = dict(enumerate(_make_pool(request, maker, patterns, grammars)))
+    with stage("drawing"):
+        pool = dict(enumerate(_make_pool(request, maker, patterns, grammars)))
     search = _HoldOutSearch(request, maker, factory, pool)
     test, train = search.run(jobs)
     robots = [*train, *test]

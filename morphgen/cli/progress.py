@@ -9,7 +9,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from functools import partial
 from typing import IO, TYPE_CHECKING, NoReturn, TypeVar
 
@@ -36,9 +36,43 @@ REDRAW_INTERVAL = 1.0
 def bar(
     args: argparse.Namespace, title: str, unit: str = "robot", total: int | None = None
 ) -> Iterator[None]:
-    """Show the progress of this block in a bar; see ``_bar``."""
-    with _bar(args, title, unit, total) as shown, show_progress(shown):
+    """Show the progress of this block in a bar, and that of its stages in others; see ``_bar``."""
+    shown = _StagedBar(partial(_bar, args, unit=unit), partial(_bar, args, title, unit, total))
+    with closing(shown), show_progress(shown):
         yield
+
+
+class _StagedBar:
+    """A bar that gives its place to the bars of stages."""
+
+    def __init__(
+        self,
+        open_stage: Callable[[str], AbstractContextManager[Progress]],
+        open_bar: Callable[[], AbstractContextManager[Progress]],
+    ) -> None:
+        self._open_stage, self._open_bar = open_stage, open_bar
+        self._shown = ExitStack()
+        self._show = self._shown.enter_context(open_bar())
+
+    def __call__(self, done: float, total: int | None) -> None:
+        """Set the bar."""
+        self._show(done, total)
+
+    @contextmanager
+    def stage(self, title: str) -> Iterator[None]:
+        """Show the reports of a block in a bar of its own."""
+        self.close()
+        with self._open_stage(title) as show, show_progress(show):
+            yield
+        self._show = self._shown.enter_context(self._open_bar())
+
+    def note(self, text: str) -> None:
+        """Print a line above the bar."""
+        note(text)
+
+    def close(self) -> None:
+        """Remove the bar."""
+        self._shown.close()
 
 
 @contextmanager

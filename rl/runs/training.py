@@ -443,7 +443,8 @@ def train(
 def require_runnable(config: RunConfig) -> None:
     """Require timesteps for at least one update, and an environment for every robot.
 
-    All numbers must fit into a checkpoint. Drawn robots may have environments one after another; see ``RunConfig.slice_updates``.
+    All numbers must fit into a checkpoint. Drawn robots may have environments one after another;
+    see ``RunConfig.slice_updates``.
     """
     require_storable(config)
     source = config.source

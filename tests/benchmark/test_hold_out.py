@@ -22,6 +22,7 @@ from morphgen.benchmark.regimes import parameters, pattern_robots
 from morphgen.errors import BenchmarkError, CompositionError, PartError
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.request import parse_words
+from morphgen.progress import show_progress
 from morphgen.splits.candidates import RobotFactory
 from morphgen.splits.split import Member, compose_member, split_id
 from morphgen.splits.split_file import parse_split, split_text
@@ -152,6 +153,18 @@ def test_repeated_robots_of_a_grammar_are_not_drawn():
     require_sound(made(["arm=lwr"], 4, test=2, patterns=(), grammars=[few]), ["arm=lwr"])
     with pytest.raises(BenchmarkError, match=r"--train 5: only 4 different robots without arm=lw"):
         made(["arm=lwr"], 5, patterns=(), grammars=[few])
+
+
+def test_drawing_is_reported_and_ends_when_a_grammar_has_no_others():
+    few = grammar("robot -> arm plane(size=choice(0.1, 0.2))", "arm -> arm3 | lwr | arm_ed")
+    reports = []
+    with (
+        show_progress(lambda done, total: reports.append((done, total))),
+        pytest.raises(BenchmarkError, match=r"--train 100000: only 4 different robots without"),
+    ):
+        made(["arm=lwr"], 100_000, test=2, patterns=(), grammars=[few])
+    assert reports[0] == (0, 400_008)
+    assert len(reports) < 2500
 
 
 def test_the_same_body_of_two_parts_is_drawn_once(monkeypatch):

@@ -11,7 +11,7 @@ import pytest
 from helpers.runs import small_config
 from morphgen.cli import progress
 from morphgen.cli.progress import training_progress
-from morphgen.progress import interrupts, report, stage
+from morphgen.progress import interrupts, part_of, report, stage
 from morphgen.rl.distributed import UpdateMetrics
 
 FLOATS = [each.name for each in fields(UpdateMetrics) if each.type == "float"]
@@ -56,6 +56,25 @@ def test_progress_is_printed_every_ten_seconds(capsys, monkeypatch):
     times = {2: "0 of 6", 12: "3 of 6", 22: "6 of 6"}
     lines = [f"stochastic on test: {count} episodes, {t} s" for t, count in times.items()]
     assert (out, err.splitlines()) == ("", lines)
+
+
+@pytest.mark.parametrize("on_terminal", [True, False])
+def test_a_stage_takes_the_place_of_the_bar(on_terminal, capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: on_terminal)
+    for name in ("FIRST_LINE", "LINE_INTERVAL", "REDRAW_INTERVAL"):
+        monkeypatch.setattr(progress, name, 0.01)
+    with progress.bar(SimpleNamespace(), "sampling", total=9), part_of(9):
+        with stage("drawing"):
+            report(2, 40)
+            time.sleep(0.2)
+        drawing = capsys.readouterr().err
+        time.sleep(0.1)
+        report(1, None)
+    sampling = capsys.readouterr().err
+    assert "drawing" in drawing
+    assert "2/40" in drawing if on_terminal else "2 of 40 robots" in drawing
+    assert "sampling" in sampling
+    assert "drawing" not in sampling
 
 
 @pytest.mark.parametrize("json", [False, True])
