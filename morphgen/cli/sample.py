@@ -106,6 +106,10 @@ def print_grammar(args: argparse.Namespace) -> None:
     opt.print_result(args, text, lambda: text.removesuffix("\n"))
 
 
+MAX_LISTED = 3
+"""Largest number of robots with the body of another one that are printed; ``--json`` has all."""
+
+
 def sample(args: argparse.Namespace) -> None:
     """Sample a set of robots and print how many were written and rejected."""
     grammar = load_sound_grammar(args.grammar, opt.library_of(args))
@@ -130,7 +134,11 @@ def sample(args: argparse.Namespace) -> None:
         # The most frequent reason comes first.
         rejected = sorted(report.rejected.items(), key=lambda entry: -entry[1])
         lines += [f"  {times} draws rejected: {reason}" for reason, times in rejected]
-        lines += [f"  {name} has the same body as {same}" for name, same in report.duplicates]
+        if twins := [f"{name} as {same}" for name, same in report.duplicates]:
+            number = f"{len(twins)} robot{' has' if len(twins) == 1 else 's have'}"
+            more = ", ..." if len(twins) > MAX_LISTED else ""
+            listed = ", ".join(twins[:MAX_LISTED])
+            lines.append(f"  {number} the same body as an earlier one: {listed}{more}")
         return "\n".join(lines)
 
     opt.print_result(args, {"folder": str(folder), **asdict(report)}, summary)

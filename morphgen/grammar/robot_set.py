@@ -15,6 +15,7 @@ import json
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -88,9 +89,25 @@ class SetReport:
 
 
 def make_set(config: SetConfig, n: int, work: SetWorker) -> SetReport:
-    """Make the robots 0 to n - 1 of a set, except those that exist."""
+    """Make the robots 0 to n - 1 of a set, except those that exist.
+
+    A set that fails before its first robot is deleted: its folder may hold the set of a corrected
+    grammar.
+    """
+    folders = (config.folder, *config.folder.parents)
+    new_folders = [folder for folder in folders if not folder.exists()]
     _prepare(config)
-    with locked_folder(config.folder), own_progress() as show:
+    try:
+        return _make_robots(config, n, work)
+    except MorphgenError:
+        for folder in new_folders:
+            with suppress(OSError):  # it has robots
+                folder.rmdir()
+        raise
+
+
+def _make_robots(config: SetConfig, n: int, work: SetWorker) -> SetReport:
+    with locked_folder(config.folder), own_progress() as show, _deleting_if_without_robots(config):
         finished = _finished(config)
         missing = [i for i in range(n) if i not in finished]
         show(n - len(missing), n)
@@ -104,6 +121,18 @@ def make_set(config: SetConfig, n: int, work: SetWorker) -> SetReport:
         report = _write_index(config, len(missing), len(finished))
         path.unlink()
     return report
+
+
+@contextmanager
+def _deleting_if_without_robots(config: SetConfig) -> Iterator[None]:
+    """Delete the files of a set that has no robot when an error ends the block."""
+    try:
+        yield
+    except MorphgenError:
+        if not _finished(config):
+            for name in (JOURNAL, INDEX, SETTINGS, GRAMMAR):
+                (config.folder / name).unlink(missing_ok=True)
+        raise
 
 
 class RobotMaker:

@@ -75,8 +75,13 @@ def test_sample_prints_the_number_of_rejected_draws(ok):
 
 def test_sample_reports_duplicate_robots(ok):
     Path("one.grammar").write_text("robot -> cubes\n")
+    begin, twin = "the same body as an earlier one:", "one-000001 as one-000000"
     out = ok("sample", "one.grammar", "-n", 2, "--light")
-    assert out.splitlines()[1] == "  one-000001 has the same body as one-000000"
+    assert out.splitlines()[1] == f"  1 robot has {begin} {twin}"
+    out = ok("sample", "one.grammar", "-n", 6, "--light")
+    (line,) = out.splitlines()[1:]
+    assert line.startswith(f"  5 robots have {begin} {twin}, one-000002 as ")
+    assert line.endswith("one-000003 as one-000000, ...")
 
 
 def test_ray_option_without_the_package_is_rejected(refused, monkeypatch):

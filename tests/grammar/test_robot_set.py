@@ -44,6 +44,28 @@ def whole(tmp_path):
     return config.folder
 
 
+@pytest.mark.parametrize("exists", [False, True])
+def test_a_set_that_fails_before_its_first_robot_leaves_nothing(exists, tmp_path):
+    folder = tmp_path / "new" / "set"
+    if exists:
+        folder.mkdir(parents=True)
+    with pytest.raises(SamplingError, match=r"failed at: where .reach > 50"):
+        make_set(plan(folder, where=("reach > 50",)), 2, make_in_processes())
+    assert [path.name for path in tmp_path.rglob("*")] == ["new", "set"] * exists
+    assert make_set(plan(folder), 1, make_in_processes()).made == 1
+
+
+def test_a_set_that_fails_later_keeps_its_robots(tmp_path):
+    def work(config, indices):
+        yield from make_in_processes()(config, indices[:1])
+        raise SamplingError("no more")
+
+    with pytest.raises(SamplingError, match="no more"):
+        make_set(plan(tmp_path / "set"), 2, work)
+    report = make_set(plan(tmp_path / "set"), 2, make_in_processes())
+    assert (report.made, report.kept) == (1, 1)
+
+
 def interrupted(plan, n, done):
     """Make a set that stops like a killed process after some robots."""
 
