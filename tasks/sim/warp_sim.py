@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -71,6 +73,9 @@ class Structure:
     tested: NDArray[np.bool_]  # which of them the world of a row tests, shape (R, P)
 
 
+# MuJoCo Warp asks for the version of mujoco three times for each model, which reads a file: half of
+# the time.
+@mock.patch.object(metadata, "version", cache(metadata.version))
 def structures(scenes: Sequence[Scene], compiled: Sequence[World]) -> list[Structure]:
     """Group environments by the structure of their models.
 
@@ -79,13 +84,16 @@ def structures(scenes: Sequence[Scene], compiled: Sequence[World]) -> list[Struc
     limits, gains and the pairs of geoms that are tested may differ.
     """
     models: dict[int, Model] = {}
+    values: dict[int, dict[str, object]] = {}  # of the fields of each model
     envs_of: dict[int, list[int]] = {}  # environments of each compiled scene
     groups: list[tuple[list[World], dict[str, None]]] = []
     for env, world in enumerate(compiled):
         if id(world) not in models:
             models[id(world)] = model = _warp_model(world, scenes[env])
+            values[id(world)] = own = {name: _comparable(getattr(model, name)) for name in _FIELDS}
             for members, batched in groups:
-                names = {*_differences(models[id(members[0])], model)}
+                first = values[id(members[0])]
+                names = {name for name, value in own.items() if value != first[name]}
                 if not PAIRS.isdisjoint(names) and not _have_one_material(members[0], world):
                     continue
                 names -= PAIRS
@@ -203,30 +211,20 @@ def _is_batched(name: str) -> bool:
     return getattr(spec, "shape", ("",))[:1] == ("*",)
 
 
-_FIELDS: dict[str, Any] = {f.name: f.type for f in fields(Model)}
+_FIELDS: dict[str, Any] = {f.name: f.type for f in fields(Model) if f.name not in UNUSED}
 
 
-def _differences(first: Model, other: Model) -> list[str]:
-    """Return the names of the fields in which two models differ."""
-    return [
-        name
-        for name in _FIELDS
-        if name not in UNUSED and not _equal(getattr(first, name), getattr(other, name))
-    ]
-
-
-def _equal(a: Any, b: Any) -> bool:  # noqa: ANN401  # fields of any type
-    """Return whether two values of a model's field are equal."""
-    if isinstance(a, wp.array):
-        first, other = a.numpy(), b.numpy()
-        return bool(first.shape == other.shape and first.tobytes() == other.tobytes())
-    if isinstance(a, np.ndarray):
-        return bool(a.shape == b.shape and a.tobytes() == b.tobytes())
-    if isinstance(a, tuple | list):
-        return len(a) == len(b) and all(_equal(x, y) for x, y in zip(a, b, strict=True))
-    if is_dataclass(a):
-        return all(_equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
-    return bool(a == b)
+def _comparable(value: Any) -> object:  # noqa: ANN401  # fields of any type
+    """Return a value of a model's field such that equal fields are equal, bit by bit."""
+    if isinstance(value, wp.array):
+        value = value.numpy()
+    if isinstance(value, np.ndarray):
+        return value.shape, value.tobytes()
+    if isinstance(value, tuple | list):
+        return [_comparable(each) for each in value]
+    if is_dataclass(value):
+        return [_comparable(getattr(value, field.name)) for field in fields(value)]
+    return value
 
 
 def _same_indices(first: World, other: World) -> bool:
