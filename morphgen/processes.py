@@ -10,10 +10,10 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from ctypes import c_byte
 from multiprocessing import get_context, parent_process, resource_tracker
 from pathlib import Path
@@ -65,9 +65,31 @@ def parallel_map(
     chunks = [items[i : i + chunk] for i in range(0, len(items), chunk)]
     jobs = min(jobs, len(chunks))
     results = (
-        map(show_progress(None)(work), items) if jobs <= 1 else _in_processes(work, chunks, jobs)
+        map(show_progress(None)(work), items)
+        if jobs <= 1
+        else _in_processes(work, chunks, jobs, lambda: 2 * jobs)  # a chunk waits for each worker
     )
     return _reporting(results, len(items))
+
+
+@contextmanager
+def parallel_stream(
+    work: Callable[[T], R], items: Iterable[T], jobs: int, missing: Callable[[], int]
+) -> Iterator[Iterator[R]]:
+    """Yield an iterator over ``work(item)`` in order, of items that may never end.
+
+    Workers are at most ``jobs`` items ahead of those that are known to be needed, and stop at the
+    end of the block.
+
+    missing: Returns how many more results are needed, at least.
+    """
+    jobs = whole_number("jobs", jobs, MorphgenError, 1)
+    if jobs == 1:
+        yield map(work, items)
+        return
+    each_alone = ((item,) for item in items)
+    with closing(_in_processes(work, each_alone, jobs, lambda: missing() + jobs)) as results:
+        yield results
 
 
 def _reporting(results: Iterable[R], total: int) -> Iterator[R]:
@@ -76,17 +98,23 @@ def _reporting(results: Iterable[R], total: int) -> Iterator[R]:
         yield result
 
 
-def _in_processes(work: Callable[[T], R], chunks: Sequence[Sequence[T]], jobs: int) -> Iterator[R]:
+def _in_processes(
+    work: Callable[[T], R],
+    chunks: Iterable[Sequence[T]],
+    jobs: int,
+    ahead: Callable[[], int],
+) -> Generator[R, None, None]:
+    """Yield the results of chunks; ``ahead`` returns how many chunks should be submitted."""
     context = get_context("spawn")  # fork would copy the locks that threads of torch or tqdm hold
     stopped = context.RawValue("b", 0)
     pool = ProcessPoolExecutor(jobs, context, _init_map_worker, (pickle.dumps(work), stopped))
     waiting = iter(chunks)
     try:
-        # A chunk waits for each worker.
-        running = deque(_submit(pool, itertools.islice(waiting, 2 * jobs)))
+        running = deque(_submit(pool, itertools.islice(waiting, ahead())))
         while running:
             results: list[R] = _result(running.popleft())
-            running.extend(_submit(pool, itertools.islice(waiting, 1)))
+            missing = max(ahead() - len(running), 0)
+            running.extend(_submit(pool, itertools.islice(waiting, missing)))
             yield from results
     except BrokenProcessPool as error:
         raise MorphgenError(

@@ -7,6 +7,7 @@ The same source gives the same robots in the same order, with any number of proc
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -28,7 +29,7 @@ from morphgen.grammar.analysis import load_sound_grammar
 from morphgen.grammar.grammar_file import SUFFIX
 from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_source import is_robot_file
-from morphgen.processes import parallel_map
+from morphgen.processes import parallel_stream
 from morphgen.progress import own_progress, show_progress
 from morphgen.rl.config import read_fields
 from morphgen.splits.candidates import RobotFactory, SampledRecipe, numbered_name
@@ -281,8 +282,8 @@ FORMAT = 1
 MAX_DRAWS = 4  # draws per requested robot, after which a grammar is considered unfit for the task
 MIN_DRAWS = 20  # the same limit for few robots: draws per grammar
 ROBOTS_PER_JOB = 16
-"""Robots that a process draws before it reports; a process takes seconds to start, an arm3 with its
-goals 0.06 s."""
+"""Robots for which another process is started: it takes seconds to start, and a robot 0.06 s if its
+goals are stored, else up to some seconds."""
 MAX_FRESH = 10  # most robots of a grammar that are drawn to evaluate on
 _FRESH = 0xF4E54
 """Mixed into the seed of robots to evaluate on, which thus are others than those to train on."""
@@ -471,28 +472,29 @@ def _draw_all(
         for name, count in source.grammars:
             grammar = load_sound_grammar(name, library)
             wanted, tried = len(kept) + count, 0
-            while missing := wanted - len(kept):
-                if tried >= max(MAX_DRAWS * count, MIN_DRAWS):
-                    raise TaskError(
-                        f"--robots {source.name}: {count - missing} of {tried} robots of "
-                        f"{grammar.name} can be used, expected {count}{fault}"
-                    )
-                numbers, tried = range(tried, tried + missing), tried + missing
-                recipes = [
-                    SampledRecipe(grammar, i, source.draw_seed, numbered_name(grammar.name, i))
-                    for i in numbers
-                ]
-                for member, spec, reason, error in parallel_map(
-                    draw_one, recipes, jobs, chunk=ROBOTS_PER_JOB
-                ):
-                    if member.robot_hash in kept:
-                        reason = DRAWN_BEFORE
-                    if reason or spec is None:
-                        skipped[reason] += 1
-                        fault = f"; {member.name}: {error or reason}"
-                    else:
-                        kept[member.robot_hash] = member, spec
-                        show(len(kept), total)
+            recipes = (
+                SampledRecipe(grammar, i, source.draw_seed, numbered_name(grammar.name, i))
+                for i in itertools.count()
+            )
+            missing = partial(lambda wanted: wanted - len(kept), wanted)
+            workers = min(jobs, -(-count // ROBOTS_PER_JOB))
+            with parallel_stream(draw_one, recipes, workers, missing) as drawn:
+                while some := missing():
+                    if tried >= max(MAX_DRAWS * count, MIN_DRAWS):
+                        raise TaskError(
+                            f"--robots {source.name}: {count - some} of {tried} robots of "
+                            f"{grammar.name} can be used, expected {count}{fault}"
+                        )
+                    tried += some
+                    for member, spec, reason, error in itertools.islice(drawn, some):
+                        if member.robot_hash in kept:
+                            reason = DRAWN_BEFORE
+                        if reason or spec is None:
+                            skipped[reason] += 1
+                            fault = f"; {member.name}: {error or reason}"
+                        else:
+                            kept[member.robot_hash] = member, spec
+                            show(len(kept), total)
     members, specs = zip(*kept.values(), strict=True)
     return DrawnRobots(members, specs, dict(sorted(skipped.items())), held_out)
 
