@@ -174,7 +174,14 @@ def test_a_resumed_batch_begins_the_same_episodes(specs):
         stub_batch(specs, MIXED, 3).load_state_dict(one.state_dict())
 
 
-@pytest.mark.parametrize("names", [("reach",), ("push",), MIXED])
+@pytest.mark.parametrize(
+    "names",
+    [
+        pytest.param(("reach",), marks=pytest.mark.slow),
+        pytest.param(("push",), marks=pytest.mark.slow),
+        MIXED,
+    ],
+)
 def test_skipping_what_changes_nothing_changes_no_bit(specs, names, monkeypatch):
     batches = [stub_batch(specs, names, 6, seed=3, observe=CHANNELS) for _ in range(2)]
     skipping, complete = batches

@@ -128,6 +128,7 @@ def test_a_robot_without_collision_shapes_is_a_structure_of_its_own():
     assert [each.envs.tolist() for each in groups] == [[0], [1]]
 
 
+@pytest.mark.slow
 def test_robots_of_one_structure_test_their_own_pairs():
     base = robot("arm=arm3 ee=stick")
     first, *_, arm_tip, stick = (link.name for link in base.links if link.collisions)
