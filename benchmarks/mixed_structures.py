@@ -1,6 +1,7 @@
 """Physics of robots of many structures in one batch on a GPU, beside two other ways.
 
     python benchmarks/mixed_structures.py [--grammar serial] [--numbers 1 10 100 300] [--envs 9600]
+        [--skip union Kamino]
 
 Drawn arms on the ground beside a block, with random joint targets: control steps per second of all
 environments. The columns:
@@ -12,13 +13,15 @@ environments. The columns:
 - Kamino: the solver of Newton for any mixture of models, likewise, if the package newton is
   installed, with ``--kamino-envs`` environments.
 
-All take ``SUBSTEPS`` physics steps of ``TIMESTEP`` for a control step.
+Each figure is printed on stderr as soon as it is measured; ``--skip`` leaves columns out. All take
+``SUBSTEPS`` physics steps of ``TIMESTEP`` for a control step.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -35,13 +38,14 @@ from tabulate import tabulate
 import morphgen
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.mujoco_model import _robot_spec, _world, worlds
-from morphgen.tasks.sim.warp_sim import CONTACTS_PER_WORLD, WarpSimulation, structures
+from morphgen.tasks.sim.warp_sim import CONTACTS_PER_WORLD, WarpSimulation, max_contacts, structures
 
 STEPS, WARM_UP, TARGETS = 60, 10, 20
 """Measured control steps, those before, and number of different targets."""
 BLOCK = Block((0.1, 0.1, 0.1), mass=0.3)
 AWAKE = -11  # state of a tree that moved in the last step
 APART = 10.0  # distance of the arms of the union [m]
+COLUMNS = ("morphgen", "union", "Kamino")
 Row = dict[str, str | int | float]
 
 
@@ -55,6 +59,7 @@ def main() -> int:
     parser.add_argument("--envs", type=int, default=9600)
     parser.add_argument("--kamino-envs", type=int, default=960)
     parser.add_argument("--device", default="cuda")
+    parser.add_argument("--skip", choices=COLUMNS, nargs="+", default=(), help="leave columns out")
     parser.add_argument("--json", type=Path, help="also write the rows here")
     args = parser.parse_args()
     rows = [_row(args, number) for number in args.numbers]
@@ -70,15 +75,17 @@ def _row(args: argparse.Namespace, number: int) -> Row:
     found = structures(scenes[:number], worlds(scenes[:number], Contacts()))
     kinds = [scenes[int(structure.envs[0])] for structure in found]
     shares = [len(structure.envs) for structure in found]
-    row: Row = {
-        "robots": number,
-        "structures": len(found),
-        "environments": args.envs,
-        "morphgen, steps/s": _morphgen(scenes, args.device),
-        "union, steps/s": _union(kinds, shares, args.envs, args.device),
+    columns: dict[str, Callable[[], float]] = {
+        "morphgen": lambda: _morphgen(scenes, args.device),
+        "union": lambda: _union(kinds, shares, args.envs, args.device),
     }
     if find_spec("newton"):
-        row["Kamino, steps/s"] = _kamino(scenes[: args.kamino_envs], args.device)
+        columns["Kamino"] = lambda: _kamino(scenes[: args.kamino_envs], args.device)
+    row: Row = {"robots": number, "structures": len(found), "environments": args.envs}
+    for name, measure in columns.items():
+        if name not in args.skip:
+            row[f"{name}, steps/s"] = speed = measure()
+            print(f"{number} robots, {name}: {speed:,.0f} steps/s", file=sys.stderr, flush=True)
     return row
 
 
@@ -145,7 +152,7 @@ def _union(kinds: Sequence[Scene], shares: Sequence[int], envs: int, device: str
     with wp.ScopedDevice(device):
         ours = mujoco_warp.put_model(model)
         data = mujoco_warp.make_data(
-            model, nworld=envs, naconmax=envs * CONTACTS_PER_WORLD, njmax=200
+            model, nworld=envs, naconmax=envs * CONTACTS_PER_WORLD, njmax=_union_rows(model, kinds)
         )
         states = np.tile(np.arange(model.ntree, dtype=np.int32), (envs, 1))  # each sleeps alone
         active = np.repeat([_tree(model, i, scene) for i, scene in enumerate(kinds)], number)
@@ -157,6 +164,15 @@ def _union(kinds: Sequence[Scene], shares: Sequence[int], envs: int, device: str
     return _steps_per_second(
         _captured(lambda: mujoco_warp.step(ours, data), SUBSTEPS, device), envs
     )
+
+
+def _union_rows(model: mujoco.MjModel, kinds: Sequence[Scene]) -> int:
+    """Return the number of constraints of a union: joint limits of all, contacts of one arm.
+
+    A limit or an equality of a sleeping arm may have a row all the same.
+    """
+    shapes = max(sum(len(link.collisions) for link in kind.robot.links) for kind in kinds)
+    return int(model.neq + np.count_nonzero(model.jnt_limited) + 3 * max_contacts(shapes + 2))
 
 
 def _tree(model: mujoco.MjModel, kind: int, scene: Scene) -> int:
