@@ -13,7 +13,7 @@ import numpy as np
 
 from morphgen.errors import TaskError
 from morphgen.model.kinematics import reach
-from morphgen.progress import part_of, show_progress
+from morphgen.progress import part_of, show_progress, stage
 from morphgen.rl.baselines import BASELINES, ZERO, Controller, baselines_for
 from morphgen.rl.baselines.simple import Random
 from morphgen.rl.config import differences
@@ -287,10 +287,12 @@ def zero_shot(source: OneRobot, policy: Path, config: EvalConfig) -> dict[str, S
     """
     name = name_of(policy)
     require_trained_tasks(read_checkpoint(policy)[0], [source], name)
-    scores = {name: evaluate_checkpoints([policy], source, config, "deterministic")[0]}
+    with stage(name):
+        scores = {name: evaluate_checkpoints([policy], source, config, "deterministic")[0]}
     for baseline in baselines_for(source.task):
         if baseline != ZERO.name:
-            (scores[baseline],) = evaluate_baseline(baseline, source, config)
+            with stage(baseline):
+                (scores[baseline],) = evaluate_baseline(baseline, source, config)
     return scores
 
 

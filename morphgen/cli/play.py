@@ -111,7 +111,7 @@ def zeroshot(args: argparse.Namespace) -> None:
     config = eval_config_of(run, args.episodes, seed=args.seed, workers=args.workers)
     tasks = with_goal(config.tasks, args.goal, [args.task])
     config = replace(config, sim=args.sim or DEFAULT_SIMULATOR, tasks=tasks)
-    with bar(args, "running the episodes"):
+    with bar(args, "preparing the goals", "episode"):
         scores = zero_shot(source, policy, config)
     opt.print_result(args, zero_shot_data(scores), lambda: _table(scores, args.task))
     if args.out is not None:
