@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -39,7 +40,9 @@ def check(args: argparse.Namespace) -> int:
     opt.print_result(
         args,
         data | refused,
-        lambda: "\n".join(_text(label, *result) for label, result in results.items()),
+        lambda: "\n".join(
+            [*(_text(label, *result) for label, result in results.items()), *_totals(results)]
+        ),
     )
     if refused:
         return 2
@@ -72,6 +75,17 @@ def _findings(
     written[folder] = source.label
     note(f"written: {folder}")  # stdout is for the findings, or for JSON
     return findings, repaired
+
+
+def _totals(results: Mapping[str, tuple[Sequence[Finding], Sequence[Finding]]]) -> list[str]:
+    """Return a line with the numbers of robots that have findings, if there are several robots."""
+    if len(results) < 2:
+        return []
+    counts = Counter[str](
+        severity for findings, _ in results.values() for severity in {f.severity for f in findings}
+    )
+    with_findings = ", ".join(f"{counts[each]} with {each}s" for each in SEVERITIES[:2])
+    return [f"{len(results)} robots: {with_findings}"]
 
 
 def _text(label: str, findings: Sequence[Finding], repaired: Sequence[Finding]) -> str:

@@ -47,7 +47,7 @@ def parse_xml(data: bytes, origin: str) -> etree._Element:
     except etree.XMLSyntaxError as error:
         line, column = error.position
         reason = " ".join(_LOCATION.sub("", error.msg or "not XML").split())
-        raise FormatError(f"{origin}:{line}:{column}: {reason}") from error
+        raise FormatError(f"{origin}:{line}:{column}: not well-formed XML: {reason}") from error
     if root.getroottree().docinfo.internalDTD is not None:
         raise _doctype_error(origin)
     return root

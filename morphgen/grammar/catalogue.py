@@ -18,7 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from morphgen.grammar.library import Library, default_library
+from morphgen.grammar.library import Library, default_library, shipped_folders
 from morphgen.grammar.manifest import Manifest, PackageSource, PartKind
 
 if TYPE_CHECKING:
@@ -37,19 +37,26 @@ def catalogue(library: Library, kind: str | None = None) -> list[dict[str, objec
     rows: list[dict[str, object]] = []
     for manifest in library.manifests(cast(PartKind, kind)):
         facts = known_facts(manifest, stored) or compute_facts(manifest)
-        source = manifest.source
         rows.append(
             {
                 "name": manifest.name,
                 "kind": manifest.kind,
                 **{key: facts[key] for key in ("dof", "reach", "mass")},
-                "source": source.package if isinstance(source, PackageSource) else "template",
+                "source": _source_name(manifest),
                 "licence": manifest.licence,
                 "manufacturer": manifest.manufacturer,
                 "summary": manifest.summary,
             }
         )
     return rows
+
+
+def _source_name(manifest: Manifest) -> str:
+    """Return the package of a part's files; ``own`` for those of a user."""
+    if isinstance(manifest.source, PackageSource):
+        return manifest.source.package
+    is_shipped = any(manifest.path.is_relative_to(folder) for folder in shipped_folders())
+    return "template" if is_shipped else "own"
 
 
 def stored_facts() -> dict[str, dict[str, Any]]:

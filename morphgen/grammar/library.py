@@ -48,7 +48,10 @@ class Library:
         """Return the manifest of a part."""
         if name not in self.paths:
             valid = self.names(kind) if kind else self.paths
-            raise PartError(f"unknown {kind or 'part'} {name!r}{nearest(name, valid)}")
+            hint = nearest(name, valid)
+            if self.folders == shipped_folders():
+                hint += "; your own parts need --library DIR"
+            raise PartError(f"unknown {kind or 'part'} {name!r}{hint}")
         manifest = _manifest(self.paths[name])
         if kind is not None and manifest.kind != kind:
             raise PartError(

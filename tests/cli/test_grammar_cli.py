@@ -57,7 +57,9 @@ def test_light_set_and_its_robots_are_accepted_by_other_commands(run, ok, cubes)
     for robot in (cubes / "cubes-000001", cubes / "cubes-000001" / "robot.urdf"):
         assert run("show", robot)[1].startswith("cubes-000001: ")
     out = ok("check", cubes)
-    assert out.count(": 0 error, 0 warning") == len(list(cubes.glob("cubes-*")))
+    number = len(list(cubes.glob("cubes-*")))
+    assert out.count(": 0 error, 0 warning") == number
+    assert out.splitlines()[-1] == f"{number} robots: 0 with errors, 0 with warnings"
 
 
 def test_sample_writes_pictures_unless_no_picture_is_given(run):

@@ -41,6 +41,8 @@ ABBREVIATIONS = {
 REFUSALS = """
 compose arm=ur55 ee=plane => unknown arm 'ur55'; did you mean 'ur5'?
 compose arm=ur5 ee=plnae => unknown ee 'plnae'; did you mean 'plane'?
+compose arm=ur55 ee=plane => ; your own parts need --library DIR
+compose arm=bob66 ee=plane => unknown arm 'bob66'; nearest of
 compose base=gantri arm=ur5 => unknown base 'gantri'; did you mean 'gantry'?
 compose base=gantry ee=plane ee.sise=1 => no parameter 'sise'; did you mean 'size'? valid: mo
 compose base=gantry ee=plane ee.size=5m => ee.size=5: out of range; expected 0.02 to 1 m (unit
@@ -50,7 +52,7 @@ compose chain bead.radius=2m => bead.radius=2: out of range; expected 0.005 to 0
 compose chian beads=5 => 'chian' is neither a grammar nor of the form key=value; did you mean
 show nowhere.urdf => nowhere.urdf: no such file
 show folder => folder holds no robot; expected a bundle
-show broken.urdf => broken.urdf:3:
+show broken.urdf => : not well-formed XML: 
 show climbing.urdf => '../../etc/hand.stl' leaves
 import climbing.urdf => '../../etc/hand.stl' leaves
 import ball.xml => type ball; expected hinge or slide, such as three hinges at one place
@@ -80,6 +82,7 @@ export prims --format gif --dark => --dark: only with --format html
 export prims --format glb --samples 9 => --samples: only with --format srdf, curobo or ros2
 export prims --format glb --spheres 4 => srdf, urdf, mjcf, sdf, curobo, usd or ros2
 export prims --out /dev/null => cannot write to /dev/null: /dev/null is a file
+export prims --format sfd => invalid choice: 'sfd'; did you mean 'sdf'?
 export prims --format pdf => curobo, gif, glb, html, mjcf, mp4, ros2, sdf, srdf, urdf
 export prims --format curobo --cover 0.9 => --cover: only with --spheres
 export prims --format curobo --spheres 40 => 40 spheres: expected 1 to 32

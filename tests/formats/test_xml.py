@@ -87,7 +87,8 @@ def test_undeclared_prefixes_are_repaired():
 
 
 def test_a_prefix_that_cannot_be_declared_is_refused():
-    with pytest.raises(FormatError, match=r"^x\.urdf:1:9: error parsing attribute name"):
+    message = r"^x\.urdf:1:9: not well-formed XML: error parsing attribute name"
+    with pytest.raises(FormatError, match=message):
         parse_description(b'<a:model="m"><b/></a:model>', "x.urdf")
 
 

@@ -186,3 +186,9 @@ def test_facts_of_new_or_changed_parts_are_computed(tmp_path):
     before = source_digest(Library([tmp_path]).manifest("cube"))
     (tmp_path / "pincer.xacro").write_text((tmp_path / "pincer.xacro").read_text() + "\n")
     assert source_digest(Library([tmp_path]).manifest("cube")) != before
+
+
+def test_the_source_of_a_users_part_is_own(tmp_path):
+    write_part(tmp_path)
+    (row,) = (r for r in catalogue(default_library([tmp_path]), "ee") if r["name"] == "pincer")
+    assert row["source"] == "own"
