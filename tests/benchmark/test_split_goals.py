@@ -2,6 +2,7 @@
 
 import hashlib
 import importlib.util
+import io
 import json
 import re
 import shutil
@@ -433,9 +434,16 @@ def test_packaged_sets_are_used_before_the_cache(tmp_path, monkeypatch):
     "member", list(MEMBERS.values())[::25], ids=lambda m: f"{m.name}-{m.task}-{m.obstacles}"
 )
 def test_sets_are_reproduced_to_the_byte(member):
+    """Except for certificates: processors round the products of inverse kinematics apart."""
     spec = env_spec(robot_of(member), member.task, obstacles=member.obstacles, anew=True)
     goals = replace(spec.goals, robot=member.name)
-    assert set_npz(goals) == packaged_set(goals.key)
+    made, stored = (np.load(io.BytesIO(npz)) for npz in (set_npz(goals), packaged_set(goals.key)))
+    assert made.files == stored.files
+    for name in made.files:
+        if name in {"behind", "across"} & goals.not_compared:
+            np.testing.assert_allclose(made[name], stored[name], rtol=0, atol=1e-12)
+        else:
+            assert made[name].tobytes() == stored[name].tobytes(), name
 
 
 @pytest.fixture
