@@ -112,7 +112,7 @@ def nearest(name: str, valid: Iterable[str], unlisted: Iterable[str] = ()) -> st
     close = [choice for choice in every if choice.lower() == name.lower()]
     # Letters in another order are a more frequent slip than others that match as many.
     close = close or [choice for choice in every if sorted(choice) == sorted(name)]
-    close = close or difflib.get_close_matches(name, every, n=1, cutoff=0.6)
+    close = close or difflib.get_close_matches(name, every, n=1, cutoff=0.5)
     guess = f"; did you mean {close[0]!r}?" if close else ";"
     if len(choices) > _MAX_LISTED:
         listed = sorted(difflib.get_close_matches(name, choices, n=8, cutoff=0.0))  # however unlike

@@ -104,7 +104,7 @@ def _print_run(run: TrainingRun, minutes: int | None) -> None:
 
 
 def _next_command(run: TrainingRun) -> str:
-    """Return a line that says how to watch, or to score, what was trained."""
+    """Return lines that say how to score or watch what was trained."""
     source, folder = run.config.source, str(run.folder)
     # Only the script that registered a task can play it.
     program = "morphgen"
@@ -117,7 +117,10 @@ def _next_command(run: TrainingRun) -> str:
         words += ["--policy", folder, "--sim", run.config.sim]
         for library in source.library:
             words += ["--library", str(library)]
-        return f"watch it: {program} play {shlex.join(words)} --out episode.mp4"
+        return (
+            f"score it: {program} eval {shlex.quote(folder)}\n"
+            f"watch it: {program} play {shlex.join(words)} --out episode.mp4"
+        )
     return f"score it: {program} eval {shlex.quote(folder)}"
 
 

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from morphgen.encoding.tokens import require_max_links
-from morphgen.errors import FormatError, MissingDependencyError, TaskError
+from morphgen.errors import FormatError, MissingDependencyError, TaskError, nearest
 from morphgen.files import write_atomic
 from morphgen.formats.data_files import parse_json, read_text
 from morphgen.formats.files import locked_folder, naming
@@ -477,6 +477,15 @@ def require_runnable(config: RunConfig) -> None:
     config.ppo.minibatch_size(config.num_envs)
 
 
+def _runs_beside(path: Path) -> list[str]:
+    """Return run folders below the nearest folder above a path that exists and has a name."""
+    above = next((each for each in path.parents if each.is_dir()), Path())
+    if not above.name:  # the working directory, or the root: too much to search
+        return []
+    files = [*above.glob(f"*/{CHECKPOINT}"), *above.glob(f"*/*/{CHECKPOINT}")]
+    return sorted(str(file.parent) for file in files)
+
+
 def checkpoint_files(path: Path) -> Iterator[Path]:
     """Yield the checkpoint files of a run."""
     if path.is_file() or (path / CHECKPOINT).is_file():
@@ -484,7 +493,9 @@ def checkpoint_files(path: Path) -> Iterator[Path]:
         return
     files = sorted((path / ROBOTS).glob(f"*/{CHECKPOINT}"))
     if not files:
-        raise TaskError(f"{path}: no checkpoint, and no folder of a run with one")
+        runs = _runs_beside(path)
+        hint = nearest(str(path), runs) if runs else ""
+        raise TaskError(f"{path}: no checkpoint, and no folder of a run with one{hint}")
     parts = subruns_of(path, read_config(path))
     missing = [part.folder.name for part in parts if not (part.folder / CHECKPOINT).is_file()]
     if missing:

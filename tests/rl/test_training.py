@@ -1,6 +1,7 @@
 """Training writes a run's folder, and resumes after an interruption at any time."""
 
 import json
+import re
 import signal
 from collections import Counter
 from dataclasses import replace
@@ -256,6 +257,14 @@ def test_se_trains_a_policy_per_robot_with_a_share_of_the_budget(tmp_path):
     assert [(part.config.num_envs, part.config.ppo.total_timesteps) for part in whole] == [
         (4, 128)
     ] * 2
+
+
+def test_a_run_folder_that_is_not_there_is_answered_with_those_beside_it(tmp_path):
+    run = tmp_path / "runs" / "mine" / "me-graph+ik" / "seed0"
+    run.mkdir(parents=True)
+    (run / CHECKPOINT).touch()
+    with pytest.raises(TaskError, match=rf"did you mean '{re.escape(str(run))}'"):
+        list(checkpoint_files(tmp_path / "runs" / "mine" / "me-graph" / "seed0"))
 
 
 def test_a_run_cannot_resume_with_a_changed_robot(tmp_path, monkeypatch):
