@@ -60,6 +60,11 @@ class ArticulatedObject:
         return replace(joint, T_parent_joint=T_root_parent @ joint.T_parent_joint)
 
     @cached_property
+    def placed_joint(self) -> ObjectJoints:
+        """The joint where the object stands in the world."""
+        return ObjectJoints([self])
+
+    @cached_property
     def base_shapes(self) -> tuple[Shape, ...]:
         """Collision shapes that stand still, in the root frame."""
         return self._shapes(rigid_groups(self.body)[0], IDENTITY)

@@ -18,7 +18,7 @@ from morphgen.model.geometry import IDENTITY, Box, Pose, Shape
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
 from morphgen.processes import usable_cores
-from morphgen.tasks.sim.articulated import ArticulatedObject, ObjectJoints
+from morphgen.tasks.sim.articulated import ArticulatedObject
 from morphgen.typing import Array
 
 if TYPE_CHECKING:  # processes of PyBullet need no torch, which takes seconds to load and 200 MB
@@ -86,8 +86,8 @@ class Scene:
         """Pose in the world of the object, or of its link that moves, at home; None without one."""
         if not isinstance(self.object, ArticulatedObject):
             return None if self.object is None else self.object.pose
-        rest = ObjectJoints([self.object]).poses(np.array(self.object.body.home))[0].tolist()
-        x, y, z, *quaternion = rest
+        home = np.array(self.object.body.home)
+        x, y, z, *quaternion = self.object.placed_joint.poses(home)[0].tolist()
         return Pose((x, y, z), rotation.normalize((*quaternion,)))
 
 

@@ -25,7 +25,7 @@ from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Robot
 from morphgen.model.tree import rigid_groups
 from morphgen.processes import sigint_blocked
-from morphgen.tasks.sim.articulated import ArticulatedObject, ObjectJoints
+from morphgen.tasks.sim.articulated import ArticulatedObject
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.motor_law import GAIN, clamp, constant, farthest_targets, is_within
 from morphgen.tasks.sim.rigid_bodies import ground_contact_links
@@ -327,18 +327,11 @@ class BulletScene:
                 flags=pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_IMPLICIT_CYLINDER,
                 **self._client,
             )
-        self._object_joints = ObjectJoints([thing])
-        for i in range(-1, pybullet.getNumJoints(self.object, **self._client)):
-            pybullet.changeDynamics(
-                self.object,
-                i,
-                lateralFriction=thing.friction,
-                linearDamping=0,
-                angularDamping=0,
-                **self._client,
-            )
-            self._assign(self.object, i, _ARTICULATED)
-            if i >= 0 and pybullet.getJointInfo(self.object, i, **self._client)[2] in _MOVABLE:
+        self._placed_joint = thing.placed_joint
+        self._add(self.object, thing.friction, _ARTICULATED)
+        for i in range(pybullet.getNumJoints(self.object, **self._client)):
+            self._add(self.object, thing.friction, _ARTICULATED, i)
+            if pybullet.getJointInfo(self.object, i, **self._client)[2] in _MOVABLE:
                 self.object_joint = i
         pybullet.changeDynamics(
             self.object, self.object_joint, jointDamping=thing.joint.damping, **self._client
@@ -361,12 +354,12 @@ class BulletScene:
         )
         return body
 
-    def _add(self, body: int, friction: float, group: int) -> int:
-        """Set a body's friction and collision group; return the body."""
+    def _add(self, body: int, friction: float, group: int, link: int = -1) -> int:
+        """Set friction and collision group of a body's base, or of a link; return the body."""
         pybullet.changeDynamics(
-            body, -1, lateralFriction=friction, linearDamping=0, angularDamping=0, **self._client
+            body, link, lateralFriction=friction, linearDamping=0, angularDamping=0, **self._client
         )
-        self._assign(body, -1, group)
+        self._assign(body, link, group)
         return body
 
     def _assign(self, body: int, link: int, group: int) -> None:
@@ -399,7 +392,7 @@ class BulletScene:
             pybullet.resetBaseVelocity(self.block, (0, 0, 0), (0, 0, 0), **self._client)
             self._block_position = tuple(block_pose[:3])  # where its weight acts in the next step
         if self.object_joint is not None:
-            position = self._object_joints.positions(np.array([block_pose], np.float64))[0]
+            position = self._placed_joint.positions(np.array([block_pose], np.float64))[0]
             pybullet.resetJointState(self.object, self.object_joint, position, **self._client)
         for body, (x, y, z, qw, qx, qy, qz) in moved:
             pybullet.resetBasePositionAndOrientation(
@@ -446,7 +439,7 @@ class BulletScene:
         """
         if self.object_joint is not None:
             q, qd, *_ = pybullet.getJointState(self.object, self.object_joint, **self._client)
-            pose = self._object_joints.poses(np.array([q]))[0, _TO_BULLET]
+            pose = self._placed_joint.poses(np.array([q]))[0, _TO_BULLET]
             return (*pose.tolist(), *(0.0,) * 5, qd)
         position, quaternion = pybullet.getBasePositionAndOrientation(self.block, **self._client)
         linear, angular = pybullet.getBaseVelocity(self.block, **self._client)

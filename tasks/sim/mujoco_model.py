@@ -91,16 +91,10 @@ def worlds(scenes: Sequence[Scene], contacts: Contacts) -> list[World]:
     models: dict[object, World] = {}
     compiled = []
     for env, scene in enumerate(scenes):
-        block = scene.block
-        placed = replace(block, pose=IDENTITY) if block is not None else scene.object
+        thing = scene.object
+        placed = replace(thing, pose=IDENTITY) if isinstance(thing, Block) else id(thing)
         obstacles = tuple(replace(obstacle, pose=IDENTITY) for obstacle in scene.obstacles)
-        key = (
-            id(scene.robot),
-            scene.T_world_root,
-            placed if block is not None else id(placed),
-            obstacles,
-            scene.ground,
-        )
+        key = (id(scene.robot), scene.T_world_root, placed, obstacles, scene.ground)
         if key not in models:
             if id(scene.robot) not in specs:
                 specs[id(scene.robot)] = _robot_spec(scene.robot, contacts)

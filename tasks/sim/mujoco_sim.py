@@ -314,7 +314,7 @@ class MujocoSimulation(HostSimulation):
                 data.qpos[world.block_q_at] = pose
             if world.object is not None:
                 pose = block_pose[row : row + 1].astype(np.float64)
-                data.qpos[world.object_q_at] = ObjectJoints([world.object]).positions(pose)
+                data.qpos[world.object_q_at] = world.object.placed_joint.positions(pose)
             mujoco.mj_kinematics(world.model, data)  # these three give the inertia of controls
             mujoco.mj_comPos(world.model, data)
             mujoco.mj_makeM(world.model, data)
