@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from morphgen.checks.self_collision import SelfCollisionChecker, untested_pairs
 from morphgen.errors import BenchmarkError
-from morphgen.model.geometry import IDENTITY, Box, Pose, Shape, Sphere
+from morphgen.model.geometry import Box, Pose, Shape, Sphere
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import (
     driving_joints,
@@ -164,7 +164,8 @@ class FreeSpace:
         link_names = {link.name for link in scene.robot.links}
         self._obstacles = [_unused(f"obstacle{k}", link_names) for k in range(len(scene.obstacles))]
         self._block = _unused("block", link_names)
-        bases = [_unused("base", link_names)] if _base_shapes(scene) else []
+        is_articulated = isinstance(scene.object, ArticulatedObject)
+        bases = [_unused("base", link_names)] if is_articulated else []
         self._num_static = len(self._obstacles) + len(bases)
         self._checker = SelfCollisionChecker(
             _with_surroundings(scene, self._obstacles, bases, self._block)
@@ -345,11 +346,6 @@ def _may_touch(scene: Scene, blocks: Array) -> NDArray[np.bool_]:
     return near
 
 
-def _base_shapes(scene: Scene) -> tuple[Shape, ...]:
-    """Return the shapes of an articulated object that stand still, in its root frame."""
-    return scene.object.base_shapes if isinstance(scene.object, ArticulatedObject) else ()
-
-
 def _with_surroundings(
     scene: Scene, obstacles: Sequence[str], bases: Sequence[str], block: str
 ) -> Robot:
@@ -377,14 +373,15 @@ def _with_surroundings(
         ground = Link(_unused("ground", link_names), collisions=(slab,))
         static_links.append(ground)
         new_joints.append(Joint(joint_name("ground"), "fixed", world.name, ground.name))
-    for name, obstacle in zip(obstacles, scene.obstacles, strict=True):
-        static_links.append(Link(name, collisions=(Shape(Box(obstacle.size)),)))
-        at = (world.name, name, obstacle.pose)
+    boxes: list[tuple[tuple[Shape, ...], Pose]]
+    boxes = [((Shape(Box(each.size)),), each.pose) for each in scene.obstacles]
+    standing = [*zip(obstacles, boxes, strict=True)]
+    if isinstance(scene.object, ArticulatedObject):
+        standing += [(base, (scene.object.base_shapes, scene.object.pose)) for base in bases]
+    for name, (shapes, pose) in standing:
+        static_links.append(Link(name, collisions=shapes))
+        at = (world.name, name, pose)
         new_joints.append(Joint(joint_name(name), "prismatic", *at, limits=(0.0, 0.0)))
-    for base in bases:  # of an articulated object, another obstacle
-        static_links.append(Link(base, collisions=_base_shapes(scene)))
-        at = (world.name, base, scene.object.pose if scene.object else IDENTITY)
-        new_joints.append(Joint(joint_name(base), "prismatic", *at, limits=(0.0, 0.0)))
     ignored = [*untested_pairs(robot), *((base, block) for base in bases)]
     ignored += [*combinations([link.name for link in static_links], 2)]
     block_links: list[Link] = []
