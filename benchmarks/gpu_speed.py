@@ -146,7 +146,7 @@ def _physics(split: str, envs: int, geometry: CollisionGeometry, device: str) ->
     actions = _actions(batch)
     graph = StepGraph(batch)  # as the learner steps
     batch.reset()
-    q, block = simulation.q.clone(), simulation.block_pose.clone()
+    q, block = simulation.q.clone(), simulation.object_pose.clone()
     poses = batch.layouts.poses if batch.layouts.any else None
     targets: list[torch.Tensor] = []
 

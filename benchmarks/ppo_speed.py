@@ -444,7 +444,7 @@ class _RandomBatch:
             score=self._score,
             terms={"random": reward},
             q=torch.zeros(self.num_envs, 1, device=self.device),
-            block_pose=torch.zeros(self.num_envs, 7, device=self.device),
+            object_pose=torch.zeros(self.num_envs, 7, device=self.device),
         )
 
 

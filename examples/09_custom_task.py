@@ -59,7 +59,7 @@ class FollowFormulas(interface.StepFormulas):
         never, score = success & ~success, choose(success, 1.0)
         return interface.StepResult(success, never, distance, score, terms)
 
-    def observe(self, block_pose):
+    def observe(self, object_pose):
         """Return the goal, in the field that policies know from reach, and the time."""
         return {"goal": self.goal, "time": self.time}
 
@@ -83,7 +83,7 @@ class FollowEnvs(interface.TaskEnvs):
             tensor.copy_(torch.where(rows, value, tensor))
         return self.q[self.index, start], torch.zeros_like(poses)  # there is no block
 
-    def target_points(self, block_pose):
+    def target_points(self, object_pose):
         """Return the goal, to which observations such as ``jacobian`` lead the tool."""
         return self.formulas.goal[:, None, :3]
 

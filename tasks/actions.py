@@ -124,9 +124,9 @@ class JointMotion(Generic[A]):
         change = at(normalized, self._link) * self._max_step
         self.targets[:] = clamped(self.targets + change, self._lower, self._upper)
 
-    def task_state(self, q: A, qd: A, *, tool: A, block_pose: A, diverged: A) -> TaskState[A]:
+    def task_state(self, q: A, qd: A, *, tool: A, object_pose: A, diverged: A) -> TaskState[A]:
         """Return the state after a step that ended at joint positions and velocities (n, J)."""
         acceleration = row_sums(abs(qd - self.previous_qd)) / CONTROL_PERIOD
         self.previous_qd[:] = qd
         violation = limit_violation(q, self._lower, self._upper)
-        return TaskState(tool, block_pose, violation, acceleration, diverged)
+        return TaskState(tool, object_pose, violation, acceleration, diverged)

@@ -51,7 +51,7 @@ class Step(StepResult[torch.Tensor]):
     """Observation after the action, also where an episode ended: to bootstrap the value there."""
     q: torch.Tensor
     """Joint positions after the action, also where an episode ended, shape (n, J) [rad or m]."""
-    block_pose: torch.Tensor
+    object_pose: torch.Tensor
     """Poses of the blocks after the action, also where an episode ended, shape (n, 7)."""
 
 
@@ -61,7 +61,7 @@ class BeforePhysics:
 
     targets: torch.Tensor  # targets of the joints of the simulation, shape (n, J) [rad or m]
     q: torch.Tensor  # positions of the independent joints, shape (n, J) [rad or m]
-    block_pose: torch.Tensor  # poses of the blocks, shape (n, 7)
+    object_pose: torch.Tensor  # poses of the blocks, shape (n, 7)
 
 
 class TaskBatch:
@@ -192,7 +192,7 @@ class TaskBatch:
 
     def field(self, name: str) -> torch.Tensor:
         """Return the current value of an observation field of the tasks, shape (n, size)."""
-        return self.groups.fields(self.simulation.block_pose)[name]
+        return self.groups.fields(self.simulation.object_pose)[name]
 
     def reset(
         self,
@@ -269,7 +269,7 @@ class TaskBatch:
         normalized = self.decode_actions(actions.to(self.device), mask.shape)
         self.motion.act(torch.where(mask, normalized, 0.0))
         targets = self.targets[:, : self._num_sim_joints].contiguous()
-        return BeforePhysics(targets, self.q, self.simulation.block_pose.clone())
+        return BeforePhysics(targets, self.q, self.simulation.object_pose.clone())
 
     def finish(self, before: BeforePhysics, diverged: torch.Tensor) -> Step:
         """Evaluate a step and begin new episodes: the part of ``step`` after the physics.
@@ -284,7 +284,10 @@ class TaskBatch:
         timed_out = self.episode_step >= self.max_episode_steps
         truncated = (timed_out | diverged) & ~result.terminated  # an end wins over the time limit
         final_observation = self._observe(state)  # before new episodes change goals and layouts
-        q, block_pose = state.q.clone(), state.block_pose.clone()  # the simulation overwrites them
+        q, object_pose = (
+            state.q.clone(),
+            state.object_pose.clone(),
+        )  # the simulation overwrites them
         ended = truncated | result.terminated
         if is_host(self.device) and not ended.any():
             observation = copied(final_observation)
@@ -299,7 +302,7 @@ class TaskBatch:
             diverged=diverged.clone(),
             final_observation=final_observation,
             q=q,
-            block_pose=block_pose,
+            object_pose=object_pose,
         )
 
     def _undone(self, before: BeforePhysics, diverged: torch.Tensor) -> PhysicsState:
@@ -312,7 +315,7 @@ class TaskBatch:
         return PhysicsState(
             q=torch.where(rows, before.q, state.q),
             qd=state.qd.masked_fill(rows, 0),
-            block_pose=torch.where(rows, before.block_pose, state.block_pose),
+            object_pose=torch.where(rows, before.object_pose, state.object_pose),
         )
 
     def observe(self) -> Observation:
@@ -367,7 +370,7 @@ class TaskBatch:
             q,
             state.qd,
             tool=self.observation.tool_positions(q),
-            block_pose=state.block_pose,
+            object_pose=state.object_pose,
             diverged=diverged,
         )
         if self.groups.needs_tool_rotation:
@@ -385,13 +388,13 @@ class TaskBatch:
         random = self._episodes.begin(mask)
         self.layouts.draw(mask, random)
         layout = self.layouts.current if self.layouts.any else None
-        q, block_pose = self.groups.begin(mask, random, layout)
+        q, object_pose = self.groups.begin(mask, random, layout)
         if options:
-            q, block_pose = place_episodes(options, self.groups, self.layouts, q, block_pose)
+            q, object_pose = place_episodes(options, self.groups, self.layouts, q, object_pose)
         self.observation.begin(mask, random)
         obstacles = (self.layouts.poses,) if self.layouts.any else ()
         sim_q = q[:, : self._num_sim_joints].contiguous()
-        self.simulation.reset(mask, sim_q, block_pose, *obstacles)
+        self.simulation.reset(mask, sim_q, object_pose, *obstacles)
         rows = mask[:, None]
         self.targets.copy_(torch.where(rows, q, self.targets))  # motors hold the start
         self.episode_step.masked_fill_(mask, 0)
@@ -408,7 +411,7 @@ class TaskBatch:
         """State of the simulation; views of its tensors where nothing has to be padded."""
         simulation = self.simulation
         q, qd = self._padded(simulation.q), self._padded(simulation.qd)
-        return PhysicsState(q, qd, simulation.block_pose)
+        return PhysicsState(q, qd, simulation.object_pose)
 
     def _padded(self, values: torch.Tensor) -> torch.Tensor:
         """Return values of the simulation's joints padded to J columns."""

@@ -179,7 +179,7 @@ class _State:
     q: torch.Tensor
     targets: torch.Tensor
     goals: ToolTargets
-    block_pose: torch.Tensor
+    object_pose: torch.Tensor
 
     @cached_property
     def T_root_link(self) -> torch.Tensor:
@@ -265,11 +265,11 @@ class KinematicChannels:
             self._solutions.forget(mask)
 
     def __call__(
-        self, q: torch.Tensor, targets: torch.Tensor, goals: ToolTargets, block_pose: torch.Tensor
+        self, q: torch.Tensor, targets: torch.Tensor, goals: ToolTargets, object_pose: torch.Tensor
     ) -> dict[str, torch.Tensor]:
         """Return the channels by name, at joint positions (n, J) and block poses (n, 7)."""
         chain = self._tables.tool_chain
-        state = _State(self._tree, chain, self._index, q, targets, goals, block_pose)
+        state = _State(self._tree, chain, self._index, q, targets, goals, object_pose)
         channels = {
             "lag": self._lag,
             "joint": self._joint_state,
@@ -330,7 +330,7 @@ class KinematicChannels:
             columns += [self._at_joints(error), self._products(angular, error)]
         if self._has_block is not None:
             point, J_root_point = self._nearest_point(state)
-            error = (state.block_pose[:, :3] - point) * self._has_block[:, None]
+            error = (state.object_pose[:, :3] - point) * self._has_block[:, None]
             columns.append(self._at_joints(POSITION_SCALE * error))
             columns += [COLUMN_SCALE * J_root_point * step, self._products(J_root_point, error)]
         return self._at_links(torch.cat(columns, dim=1).transpose(1, 2))
@@ -404,11 +404,11 @@ class KinematicChannels:
         centres = T_root_link[..., :3, 3] + (
             T_root_link[..., :3, :3] @ self._shape_pose[..., :3, None]
         ).squeeze(-1)
-        to_block = (state.block_pose[:, None, :3] - centres)[..., None]
+        to_block = (state.object_pose[:, None, :3] - centres)[..., None]
         local = (R_root_shape.transpose(-1, -2) @ to_block).squeeze(-1)
         inside = local.clamp(-self._half_extents, self._half_extents)
         points = centres + (R_root_shape @ inside[..., None]).squeeze(-1)
-        distance = torch.linalg.vector_norm(points - state.block_pose[:, None, :3], dim=-1)
+        distance = torch.linalg.vector_norm(points - state.object_pose[:, None, :3], dim=-1)
         has_shape = self._half_extents.amax(dim=-1) > 0
         link = torch.where(has_shape, distance, torch.inf).argmin(dim=1)
         point = points[rows, link]

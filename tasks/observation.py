@@ -394,10 +394,10 @@ class PointClouds:
         self._local.copy_(torch.where((mask[:, None] & self.mask)[..., None], local, self._local))
         self._on_block.copy_(torch.where(mask[:, None], on_block & self.mask, self._on_block))
 
-    def __call__(self, block_pose: torch.Tensor) -> torch.Tensor:
+    def __call__(self, object_pose: torch.Tensor) -> torch.Tensor:
         """Return the points in the root frame, shape (n, P, 3) [m]; zeros without boxes."""
-        R = matrix_from_quaternion(block_pose[:, 3:])
-        moved = self._local @ R.transpose(1, 2) + block_pose[:, None, :3]
+        R = matrix_from_quaternion(object_pose[:, 3:])
+        moved = self._local @ R.transpose(1, 2) + object_pose[:, None, :3]
         return torch.where(self._on_block[..., None], moved, self._local)
 
 
@@ -415,7 +415,7 @@ class PhysicsState:
 
     q: torch.Tensor
     qd: torch.Tensor
-    block_pose: torch.Tensor
+    object_pose: torch.Tensor
 
 
 class BatchObservation:
@@ -478,7 +478,7 @@ class BatchObservation:
         """Return the observation in a state, in tensors that the caller owns."""
         return {
             "tokens": self.tokens(state.q),
-            **self._groups.fields(state.block_pose),
+            **self._groups.fields(state.object_pose),
             **copied(self._constant_entries),
             **self.requested(state, targets, previous_action),
         }
@@ -487,7 +487,7 @@ class BatchObservation:
         self, state: PhysicsState, targets: torch.Tensor, previous_action: torch.Tensor
     ) -> Observation:
         """Return the entries that the configuration asks for; the arguments are those of a call."""
-        q, block_pose, config = state.q, state.block_pose, self._config
+        q, object_pose, config = state.q, state.object_pose, self._config
         observation: Observation = {}
         if not config.state:
             observation["object"] = torch.zeros(len(q), OBJECT.size, device=q.device)
@@ -498,10 +498,10 @@ class BatchObservation:
         if config.tool:
             observation["tool"] = self.tool_positions(q)
         if self._kinematics is not None:
-            goals = self._groups.tool_targets(block_pose)
-            observation |= self._kinematics(q, targets, goals, block_pose)
+            goals = self._groups.tool_targets(object_pose)
+            observation |= self._kinematics(q, targets, goals, object_pose)
         if self._points is not None:
-            observation["points"] = self._points(block_pose)
+            observation["points"] = self._points(object_pose)
         return observation
 
 

@@ -25,18 +25,18 @@ def place_episodes(
     groups: TaskGroups,
     layouts: EpisodeLayouts,
     q: torch.Tensor,
-    block_pose: torch.Tensor,
+    object_pose: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return q (n, J) and block poses (n, 7) of episodes that were drawn, after the options.
 
     Options name joint positions, and goals or blocks where the tasks allow it.
     """
     wanted_rows = _rows(options, groups, layouts.specs)
-    q, block_pose = q.clone(), block_pose.clone()
+    q, object_pose = q.clone(), object_pose.clone()
     for env, (spec, wanted) in enumerate(zip(layouts.specs, wanted_rows, strict=True)):
         robot, space = spec.robot, layouts.space(env)
         drawn_q, drawn_block = (
-            rows[env].double().cpu().numpy() for rows in (q[:, : robot.dof], block_pose)
+            rows[env].double().cpu().numpy() for rows in (q[:, : robot.dof], object_pose)
         )
         start = drawn_q
         if Q in wanted:
@@ -59,8 +59,8 @@ def place_episodes(
                 f"with itself or the scene{_among(spec)}"
             )
         q[env, : robot.dof] = torch.from_numpy(start)
-        block_pose[env] = torch.from_numpy(block)
-    return q, block_pose
+        object_pose[env] = torch.from_numpy(block)
+    return q, object_pose
 
 
 def _rows(

@@ -40,7 +40,7 @@ class TaskState(Generic[A]):
 
     tool: A
     """Position of the tool, shape (k, 3) [m]."""
-    block_pose: A
+    object_pose: A
     """Pose of the block, shape (k, 7); zeros if there is none."""
     limit_violation: A
     """Sum over joints of their distance outside of the limits, shape (k,) [rad and m]."""
@@ -83,7 +83,7 @@ class StepFormulas(ABC, Generic[A]):
         """Return the result of a step."""
 
     @abstractmethod
-    def observe(self, block_pose: A) -> dict[str, A]:
+    def observe(self, object_pose: A) -> dict[str, A]:
         """Return the task's observation fields by name from poses of the block, shape (k, 7)."""
 
 
@@ -268,24 +268,24 @@ class TaskEnvs(ABC):
         """Return the result of a step, and advance whatever depends on time."""
         return self.formulas.evaluate(state)
 
-    def observe(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
+    def observe(self, object_pose: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the task's observation fields by name, each of shape (k, size).
 
         Args:
-            block_pose: Pose of the block, shape (k, 7).
+            object_pose: Pose of the block, shape (k, 7).
         """
-        return self.formulas.observe(block_pose)
+        return self.formulas.observe(object_pose)
 
-    def target_points(self, block_pose: torch.Tensor) -> torch.Tensor:
+    def target_points(self, object_pose: torch.Tensor) -> torch.Tensor:
         """Return points that the tool should visit, shape (k, P, 3) [m]; P is 0 by default.
 
         Args:
-            block_pose: Pose of the block, shape (k, 7).
+            object_pose: Pose of the block, shape (k, 7).
         """
-        return block_pose.new_zeros(len(block_pose), 0, 3)
+        return object_pose.new_zeros(len(object_pose), 0, 3)
 
     def place(
-        self, row: int, options: Mapping[str, Array], space: FreeSpace, q: Array, block_pose: Array
+        self, row: int, options: Mapping[str, Array], space: FreeSpace, q: Array, object_pose: Array
     ) -> tuple[Array, Array]:
         """Begin an episode that ``begin`` has drawn as ``reset(options=...)`` asks for.
 
@@ -296,7 +296,7 @@ class TaskEnvs(ABC):
             options: Vectors of finite numbers: of ``Task.reset_options``, and perhaps ``q``.
             space: The robot in the scene of the episode, for tests of collisions.
             q: Joint positions at the start: those of the option ``q``, or drawn; shape (dof,).
-            block_pose: Pose of the block at the start, shape (7,); zeros without one.
+            object_pose: Pose of the block at the start, shape (7,); zeros without one.
 
         Returns:
             Joint positions and pose of the block at the start.
@@ -304,7 +304,7 @@ class TaskEnvs(ABC):
         Raises:
             TaskError: If an option cannot be met; the message says why.
         """
-        return q, block_pose
+        return q, object_pose
 
     def target_rotations(self) -> torch.Tensor | None:
         """Return orientations for the tool, shape (k, 3, 3); None if the task wants none."""
@@ -428,14 +428,14 @@ class Task(ABC, Generic[C, G]):
         return Scene(robot, obstacles=goals.obstacles, ground=ground)
 
     def achieved_goal(
-        self, config: C, tool_pose: NDArray[np.float32], block_pose: NDArray[np.float32]
+        self, config: C, tool_pose: NDArray[np.float32], object_pose: NDArray[np.float32]
     ) -> NDArray[np.float32]:
         """Return the goal that a state achieves, shape (g,), for a task with a ``goal_field``.
 
         Args:
             config: Constants of the task.
             tool_pose: Pose of the tool in the root frame, shape (7,).
-            block_pose: Pose of the block, shape (7,).
+            object_pose: Pose of the block, shape (7,).
 
         Raises:
             TaskError: If the task does not define it.

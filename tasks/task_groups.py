@@ -57,10 +57,10 @@ class _Group:
         expected = "two tensors: joint positions and poses of the block"
         is_pair = isinstance(start, tuple) and len(start) == 2
         require_returned(self.task.name, "begin", start, is_pair, expected)
-        q, block_pose = start
+        q, object_pose = start
         self._require("begin: the joint positions", q, num_joints)
-        self._require("begin: the poses of the block", block_pose, 7)
-        return {"q": q, "block_pose": block_pose}
+        self._require("begin: the poses of the block", object_pose, 7)
+        return {"q": q, "object_pose": object_pose}
 
     def result(self, state: TaskState[torch.Tensor]) -> StepResult[torch.Tensor]:
         """Return the result of ``TaskEnvs.evaluate``."""
@@ -77,9 +77,9 @@ class _Group:
             self._require(f"evaluate: the reward term {name!r}", value)
         return result
 
-    def fields(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
+    def fields(self, object_pose: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the values of ``TaskEnvs.observe``: one for each field that the task declares."""
-        values = self.envs.observe(block_pose)
+        values = self.envs.observe(object_pose)
         sizes = {field.name: field.size for field in self.task.fields}
         for name in sizes.keys() ^ values.keys():
             fault = f"the field {name!r} is missing"
@@ -172,7 +172,7 @@ class TaskGroups:
             )
             starts.append(group.start(start, self._num_joints))
         merged = self._merged(starts)
-        return merged["q"], merged["block_pose"]
+        return merged["q"], merged["object_pose"]
 
     @property
     def reset_options(self) -> dict[str, tuple[int, ...]]:
@@ -185,10 +185,10 @@ class TaskGroups:
         }
 
     def place(
-        self, env: int, options: Mapping[str, Array], space: FreeSpace, q: Array, block_pose: Array
+        self, env: int, options: Mapping[str, Array], space: FreeSpace, q: Array, object_pose: Array
     ) -> tuple[Array, Array]:
         """Begin an episode as options ask for; see ``TaskEnvs.place``."""
-        return self._envs_of(env).place(int(self._row[env]), options, space, q, block_pose)
+        return self._envs_of(env).place(int(self._row[env]), options, space, q, object_pose)
 
     def evaluate(
         self, state: TaskState[torch.Tensor]
@@ -213,11 +213,11 @@ class TaskGroups:
         reward = merged.pop("reward")
         return StepResult(**merged, terms=terms, **self._merged(angles, torch.nan)), reward
 
-    def fields(self, block_pose: torch.Tensor) -> dict[str, torch.Tensor]:
+    def fields(self, object_pose: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the observation fields of all tasks, shape (n, size) each, as copies."""
         n, device = len(self._row), self._row.device
         values = self._merged(
-            [group.fields(self._rows_of(group, block_pose)) for group in self._groups.values()]
+            [group.fields(self._rows_of(group, object_pose)) for group in self._groups.values()]
         )
         return {
             field.name: values[field.name].clone()
@@ -226,11 +226,11 @@ class TaskGroups:
             for field in self.observation_fields
         }
 
-    def tool_targets(self, block_pose: torch.Tensor) -> ToolTargets:
+    def tool_targets(self, object_pose: torch.Tensor) -> ToolTargets:
         """Return the points and orientations that the tasks want the tool at."""
         groups = self._groups.values()
-        points = [group.envs.target_points(self._rows_of(group, block_pose)) for group in groups]
-        order = torch.arange(max(each.shape[1] for each in points), device=block_pose.device)
+        points = [group.envs.target_points(self._rows_of(group, object_pose)) for group in groups]
+        order = torch.arange(max(each.shape[1] for each in points), device=object_pose.device)
         targets = []
         for group, values in zip(groups, points, strict=True):
             padding = (0, 0, 0, len(order) - values.shape[1])
@@ -242,7 +242,7 @@ class TaskGroups:
             targets.append(target)
         merged = self._merged(targets)
         if "rotations" in merged:  # any rotation where no task wants one, rather than zeros
-            wanted, identity = merged["has_rotation"], torch.eye(3, device=block_pose.device)
+            wanted, identity = merged["has_rotation"], torch.eye(3, device=object_pose.device)
             merged["rotations"] = merged["rotations"].where(wanted[:, None, None], identity)
         return ToolTargets(**merged)
 

@@ -173,7 +173,7 @@ def _step(robot: _SimulatedRobot) -> None:
         robot.is_running, track.fault = False, str(error)
         return
     if BLOCK in track.poses:
-        track.poses[BLOCK].append(_to_numpy(step.block_pose[0]))
+        track.poses[BLOCK].append(_to_numpy(step.object_pose[0]))
     ended = bool(step.terminated[0] | step.truncated[0])
     for name, pose in batch.groups.marker_poses(0).items():
         poses = track.poses[name]

@@ -469,7 +469,7 @@ class ScriptedPush:
             self._specs, self._planners = task.specs, {}
         if self._task is not task:
             self._begin(task)
-        block = task.simulation.block_pose
+        block = task.simulation.object_pose
         tool = frame_positions(task.robot_tables.tool_chain, task.env_robot_index, task.q)
         is_push = task.task_mask("push")
         new = is_push & (task.episode_step == 0)
@@ -562,7 +562,7 @@ class ScriptedPush:
         """Return targets (n, J) with the tool farther along y, and nearer to the block along x."""
         goal = frame_positions(task.robot_tables.tool_chain, task.env_robot_index, task.targets)
         lead = goal[:, 1] - tool[:, 1]
-        stands = task.simulation.block_velocity[:, 1] < MOVING
+        stands = task.simulation.object_velocity[:, 1] < MOVING
         grow = self.pushing & stands & (lead > self._lead - SPEED)
         self._lead = torch.where(grow, self._lead + LEAD_STEP, self._lead).clamp(max=MAX_LEAD)
         dx = GAIN * (block[:, 0] + self._offset - tool[:, 0])

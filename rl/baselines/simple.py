@@ -57,7 +57,7 @@ class ReachGoals:
 def reach_goals(task: TaskBatch) -> ReachGoals:
     """Return the goals of a batch whose environments reach."""
     config = next(spec.config for spec in task.specs if isinstance(spec.config, ReachConfig))
-    rotations = task.groups.tool_targets(task.simulation.block_pose).rotations
+    rotations = task.groups.tool_targets(task.simulation.object_pose).rotations
     return ReachGoals(task.field("goal")[:, :3], rotations, config.metres_per_radian)
 
 

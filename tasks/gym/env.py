@@ -77,15 +77,15 @@ class NumpyStepper:
         self._episode_step = batch.episode_step.numpy()
         self._max_episode_steps = int(batch.max_episode_steps[0])
         simulation = batch.simulation
-        tensors = simulation.q, simulation.qd, simulation.block_pose
-        self._q, self._qd, self._block_pose = (tensor[0].numpy() for tensor in tensors)
+        tensors = simulation.q, simulation.qd, simulation.object_pose
+        self._q, self._qd, self._object_pose = (tensor[0].numpy() for tensor in tensors)
         self._constant: NumpyObservation = {}
         self._requested: Callable[[], NumpyObservation] = dict
 
     def begin(self, observation: NumpyObservation) -> None:
         """Begin an episode that the batch has begun."""
         requested = self._unpadded(self._batch.requested_entries()).keys()
-        changing = {"tokens", *self._formulas.observe(self._block_pose), *requested}
+        changing = {"tokens", *self._formulas.observe(self._object_pose), *requested}
         self._constant = {k: v.copy() for k, v in observation.items() if k not in changing}
         in_numpy: dict[str, Callable[[], Array]] = {
             "velocity": lambda: self._link_joints(self._qd)[self._rows],
@@ -109,12 +109,12 @@ class NumpyStepper:
                 self._q,
                 self._qd,
                 tool=self._tool(),
-                block_pose=self._block_pose,
+                object_pose=self._object_pose,
                 diverged=np.asarray(diverged)[()],
             )
         )
         observation = {"tokens": self._tokens(self._q)[self._rows]}
-        for name, values in self._formulas.observe(self._block_pose).items():
+        for name, values in self._formulas.observe(self._object_pose).items():
             observation[name] = values.copy()
         for name, values in self._constant.items():
             observation[name] = values.copy()
@@ -125,12 +125,12 @@ class NumpyStepper:
 
     def _simulate(self) -> bool:
         """Step the simulation, undo the step if it diverged; return whether it did."""
-        q, block_pose = self._q.copy(), self._block_pose.copy()
+        q, object_pose = self._q.copy(), self._object_pose.copy()
         simulation = self._batch.simulation
         mask = simulation.step(self._batch.targets)
         diverged = bool(mask)  # of one environment
         if diverged:
-            simulation.reset(mask, torch.from_numpy(q[None]), torch.from_numpy(block_pose[None]))
+            simulation.reset(mask, torch.from_numpy(q[None]), torch.from_numpy(object_pose[None]))
             self._motion.previous_qd[:] = 0
         return diverged
 
@@ -383,7 +383,7 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         step = self._step_batch(actions, None, keeps_ends=True)
         if step.terminated[0] or step.truncated[0]:
             self._next_has_begun = True
-            self._final_physics = step.q, step.block_pose
+            self._final_physics = step.q, step.object_pose
         observation, ended = self._without_padding(step.final_observation), bool(step.terminated)
         info = _info(step, bool(step.diverged))
         return observation, float(step.reward), ended, bool(step.truncated), info
@@ -393,13 +393,13 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         if not self._goal_env:
             return observation
         task, batch = TASKS[self.task], self.batch
-        q, block_pose = self._final_physics or (batch.q, batch.simulation.block_pose)
+        q, object_pose = self._final_physics or (batch.q, batch.simulation.object_pose)
         chain = batch.robot_tables.tool_chain
         tool = Pose.from_matrix(frame_pose(chain, batch.env_robot_index, q)[0].double().numpy())
         achieved = task.achieved_goal(
             self.env_spec.config,
             np.array([*tool.position, *tool.quaternion], np.float32),
-            block_pose[0].clone().numpy(),
+            object_pose[0].clone().numpy(),
         )
         rest = {name: value for name, value in observation.items() if name != task.goal_field}
         return {

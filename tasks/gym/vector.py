@@ -231,7 +231,7 @@ class BatchEnv:
             env: replace(
                 state,
                 q=step.q[env, : len(state.q)].cpu().numpy(),
-                block=None if state.block is None else step.block_pose[env].cpu().numpy(),
+                block=None if state.block is None else step.object_pose[env].cpu().numpy(),
             )
             for env, state in enumerate(before)
             if step.terminated[env] or step.truncated[env]

@@ -40,10 +40,10 @@ class PushFormulas(StepFormulas[A]):
 
     def evaluate(self, state: TaskState[A]) -> StepResult[A]:
         """Compare the blocks with their lines."""
-        y, config = state.block_pose[..., 1], self._config
+        y, config = state.object_pose[..., 1], self._config
         to_go = positive_part(self._line - y)
         success = (y > self._line) & ~state.diverged
-        approach = row_norms(state.tool - state.block_pose[..., :3])
+        approach = row_norms(state.tool - state.object_pose[..., :3])
         return StepResult(
             success=success,
             terminated=success & ~state.diverged,
@@ -52,9 +52,9 @@ class PushFormulas(StepFormulas[A]):
             terms=push_terms(config, to_go, approach, state.limit_violation, success),
         )
 
-    def observe(self, block_pose: A) -> dict[str, A]:
+    def observe(self, object_pose: A) -> dict[str, A]:
         """Return the blocks and their lines."""
-        block = namespace_of(block_pose).concatenate([block_pose, self._shape], -1)
+        block = namespace_of(object_pose).concatenate([object_pose, self._shape], -1)
         return {"object": block, "line": self._line[..., None]}
 
 
@@ -96,15 +96,15 @@ class PushEnvs(TaskEnvs):
         return self._q[self._env_spec_index, start], self._blocks[self._env_spec_index, start]
 
     def place(
-        self, row: int, options: Mapping[str, Array], space: FreeSpace, q: Array, block_pose: Array
+        self, row: int, options: Mapping[str, Array], space: FreeSpace, q: Array, object_pose: Array
     ) -> tuple[Array, Array]:
         """Put the block where the option ``block`` says: a position, or a pose.
 
         Unless ``q`` is given, too, a drawn start that the block would touch gives way to another.
         """
         if (wanted := options.get("block")) is None:
-            return q, block_pose
-        turn = block_pose[3:] if len(wanted) == 3 else unit_quaternion(wanted[3:], "block")
+            return q, object_pose
+        turn = object_pose[3:] if len(wanted) == 3 else unit_quaternion(wanted[3:], "block")
         block = np.concatenate([wanted[:3], turn])
         sets = self._env_spec_index[row]
         require_pushable(space, block, float(self._final_line[row]))
@@ -114,9 +114,9 @@ class PushEnvs(TaskEnvs):
         free = space.free(starts, np.tile(block, (len(starts), 1)))
         return starts[int(free.argmax())], block
 
-    def target_points(self, block_pose: torch.Tensor) -> torch.Tensor:
+    def target_points(self, object_pose: torch.Tensor) -> torch.Tensor:
         """Return a point behind the block, its centre, and its centre beyond the line."""
-        centre = block_pose[:, :3]
+        centre = object_pose[:, :3]
         behind, beyond = centre.clone(), centre.clone()
         behind[:, 1] -= self._size[:, 1] / 2 + GAP
         beyond[:, 1] = self.line + GAP

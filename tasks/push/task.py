@@ -150,10 +150,10 @@ class Push(Task[PushConfig, PushStartSet]):
         return PushEnvs(specs, env_spec_index, num_joints)
 
     def achieved_goal(
-        self, config: PushConfig, tool_pose: NDArray[np.float32], block_pose: NDArray[np.float32]
+        self, config: PushConfig, tool_pose: NDArray[np.float32], object_pose: NDArray[np.float32]
     ) -> NDArray[np.float32]:
         """Return the y of the block's centre."""
-        return block_pose[1:2]
+        return object_pose[1:2]
 
     def goal_reward(
         self, config: PushConfig, achieved: torch.Tensor, desired: torch.Tensor

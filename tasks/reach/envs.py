@@ -51,7 +51,7 @@ class ReachFormulas(StepFormulas[A]):
             angle=angle,
         )
 
-    def observe(self, block_pose: A) -> dict[str, A]:
+    def observe(self, object_pose: A) -> dict[str, A]:
         """Return the goals."""
         return {"goal": self._goal}
 
@@ -100,11 +100,11 @@ class ReachEnvs(TaskEnvs):
         return q[:, 0], torch.zeros_like(self.goal)
 
     def place(
-        self, row: int, options: Mapping[str, Array], space: FreeSpace, q: Array, block_pose: Array
+        self, row: int, options: Mapping[str, Array], space: FreeSpace, q: Array, object_pose: Array
     ) -> tuple[Array, Array]:
         """Set the goal of the option ``goal``: a position, or a pose, that the tool can reach."""
         if (wanted := options.get("goal")) is None:
-            return q, block_pose
+            return q, object_pose
         if len(wanted) == 3 and self.needs_tool_rotation:
             raise TaskError("option 'goal' has shape (3,); a goal that is a pose needs (7,)")
         if len(wanted) == 7:
@@ -129,13 +129,13 @@ class ReachEnvs(TaskEnvs):
         self.goal[row] = torch.from_numpy(wanted)
         self.goal_configuration[row, : robot.dof] = torch.from_numpy(found)
         self._goal_rotation[row] = matrix_from_quaternion(self.goal[row, 3:])
-        return q, block_pose
+        return q, object_pose
 
     def target_rotations(self) -> torch.Tensor | None:
         """Return the goals' rotation matrices, shape (k, 3, 3); None for goals of positions."""
         return self._goal_rotation if self.needs_tool_rotation else None
 
-    def target_points(self, block_pose: torch.Tensor) -> torch.Tensor:
+    def target_points(self, object_pose: torch.Tensor) -> torch.Tensor:
         """Return the position of the goal."""
         return self.goal[:, None, :3]
 

@@ -191,7 +191,7 @@ class Reach(Task[ReachConfig, ReachGoalSet]):
         return ReachEnvs(specs, env_spec_index, num_joints)
 
     def achieved_goal(
-        self, config: ReachConfig, tool_pose: NDArray[np.float32], block_pose: NDArray[np.float32]
+        self, config: ReachConfig, tool_pose: NDArray[np.float32], object_pose: NDArray[np.float32]
     ) -> NDArray[np.float32]:
         """Return the position of the tool, or its pose if goals are poses."""
         return tool_pose if config.goal == "pose" else tool_pose[:3]

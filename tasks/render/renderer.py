@@ -334,7 +334,7 @@ class Renderer:
 def render_state(batch: TaskBatch, env: int = 0) -> RenderState:
     """Return the current state of an environment of a batch."""
     spec = batch.specs[int(batch.env_robot_index[env])]
-    block = None if spec.scene.object is None else _copied(batch.simulation.block_pose[env])
+    block = None if spec.scene.object is None else _copied(batch.simulation.object_pose[env])
     return RenderState(
         _copied(batch.q[env, : spec.robot.dof]),
         block,

@@ -125,7 +125,7 @@ class Simulation(ABC):
     """Positions of the independent joints, shape (n, J) [rad or m]."""
     qd: torch.Tensor
     """Velocities of the independent joints, shape (n, J) [rad/s or m/s]."""
-    block_pose: torch.Tensor
+    object_pose: torch.Tensor
     """Poses in the world of the blocks, or of the links of articulated objects that move, which
     determine their joints: x, y, z, qw, qx, qy, qz, (n, 7); zeros without an object."""
 
@@ -139,14 +139,14 @@ class Simulation(ABC):
 
     @property
     @abstractmethod
-    def block_velocity(self) -> torch.Tensor:
+    def object_velocity(self) -> torch.Tensor:
         """Linear velocities of the blocks in the world, (n, 3); zeros without one [m/s]."""
 
     def reset(
         self,
         mask: torch.Tensor,
         q: torch.Tensor,
-        block_pose: torch.Tensor,
+        object_pose: torch.Tensor,
         obstacle_poses: torch.Tensor | None = None,
     ) -> None:
         """Put some environments at rest; clear everything that earlier steps left behind.
@@ -157,7 +157,7 @@ class Simulation(ABC):
         Args:
             mask: Environments to reset, shape (n,), bool.
             q: Positions of the independent joints, which become the targets, shape (n, J).
-            block_pose: Poses of the blocks, shape (n, 7); ignored without a block.
+            object_pose: Poses of the blocks, shape (n, 7); ignored without a block.
             obstacle_poses: Poses of the obstacles in the world, shape (n, O, 7), padded to the
                 largest number of obstacles; None leaves them where they are.
 
@@ -169,7 +169,7 @@ class Simulation(ABC):
         for name, values, shape in (
             ("a mask", mask, (n,)),
             ("q", q, tuple(self.q.shape)),
-            ("blocks", block_pose, (n, 7)),
+            ("blocks", object_pose, (n, 7)),
             ("obstacles", obstacle_poses, (n, self._num_obstacles, 7)),
         ):
             if values is not None and tuple(values.shape) != shape:
@@ -178,7 +178,7 @@ class Simulation(ABC):
                 )
         if str(mask.dtype) != "torch.bool":
             raise ValueError(f"reset with a mask of type {mask.dtype}; expected torch.bool")
-        self._reset(mask, q, block_pose, obstacle_poses)
+        self._reset(mask, q, object_pose, obstacle_poses)
 
     def step(self, targets: torch.Tensor) -> torch.Tensor:
         """Advance all environments by one control step.
@@ -214,7 +214,7 @@ class Simulation(ABC):
         self,
         mask: torch.Tensor,
         q: torch.Tensor,
-        block_pose: torch.Tensor,
+        object_pose: torch.Tensor,
         obstacle_poses: torch.Tensor | None,
     ) -> None: ...
 
@@ -263,7 +263,7 @@ class HostSimulation(Simulation):
         super().__init__(scenes, torch.device("cpu"))
         dofs = np.array([scene.robot.dof for scene in scenes])
         self._is_joint: NDArray[np.bool_] = np.arange(dofs.max()) < dofs[:, None]
-        self._has_block = np.array([[scene.object is not None] for scene in scenes])
+        self._has_object = np.array([[scene.object is not None] for scene in scenes])
         self._targets: Array = np.zeros(self._is_joint.shape)
         self._seen: torch.Tensor | None = None
         self._num_steps, self._reset_at = 0, np.zeros(len(scenes), np.int64)
@@ -275,7 +275,7 @@ class HostSimulation(Simulation):
         self,
         envs: NDArray[np.int64],
         q: NDArray[Any],
-        block_pose: NDArray[Any],
+        object_pose: NDArray[Any],
         obstacle_poses: NDArray[Any] | None,
     ) -> None:
         """Put k environments at rest; all other arguments have k rows."""
@@ -288,14 +288,14 @@ class HostSimulation(Simulation):
         self,
         mask: torch.Tensor,
         q: torch.Tensor,
-        block_pose: torch.Tensor,
+        object_pose: torch.Tensor,
         obstacle_poses: torch.Tensor | None,
     ) -> None:
         """See ``reset``."""
         rows = mask.numpy()[:, None]
         # Padding, poses without a block, and rows that are not reset may hold anything.
         positions = np.where(rows & self._is_joint, q.numpy(), 0)
-        blocks = np.where(rows & self._has_block, block_pose.numpy(), 0)
+        blocks = np.where(rows & self._has_object, object_pose.numpy(), 0)
         self._require_finite("reset to q", positions)
         self._require_finite("reset to block", blocks)
         obstacles = None

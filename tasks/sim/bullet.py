@@ -79,7 +79,7 @@ class BulletSimulation(HostSimulation):
                     np.zeros((len(scenes), *part.shape[1:]), np.float32) for part in self._state
                 ]
             tensors = map(torch.from_numpy, self._state)
-            self.q, self.qd, self.block_pose, self._block_velocity = tensors
+            self.q, self.qd, self.object_pose, self._object_velocity = tensors
             for worker in self.workers:
                 worker.receive()
             self._go_home()
@@ -88,9 +88,9 @@ class BulletSimulation(HostSimulation):
             raise
 
     @property
-    def block_velocity(self) -> torch.Tensor:
-        """Velocities of the blocks; see ``Simulation.block_velocity``."""
-        return self._block_velocity
+    def object_velocity(self) -> torch.Tensor:
+        """Velocities of the blocks; see ``Simulation.object_velocity``."""
+        return self._object_velocity
 
     def close(self) -> None:
         """Free the clients and end the workers; a second call does nothing."""
@@ -105,7 +105,7 @@ class BulletSimulation(HostSimulation):
         self,
         envs: NDArray[np.int64],
         q: Float32,
-        block_pose: Float32,
+        object_pose: Float32,
         obstacle_poses: Float32 | None,
     ) -> None:
         arguments = []
@@ -113,7 +113,7 @@ class BulletSimulation(HostSimulation):
             mine = np.isin(envs, share)
             others = None if obstacle_poses is None else obstacle_poses[mine]
             rows = np.searchsorted(share, envs[mine])
-            arguments.append((rows, q[mine], block_pose[mine], others))
+            arguments.append((rows, q[mine], object_pose[mine], others))
         self._call("reset", arguments)
         self._unreset -= {*envs.tolist()}
 

@@ -378,7 +378,7 @@ class BulletScene:
     def reset(
         self,
         positions: Sequence[float],
-        block_pose: Sequence[float],
+        object_pose: Sequence[float],
         obstacle_poses: Sequence[Sequence[float]] | None = None,
     ) -> None:
         """Put robot, at positions of all movable joints, and block at rest; clear contacts."""
@@ -388,11 +388,11 @@ class BulletScene:
             [] if obstacle_poses is None else [*zip(self._obstacles, obstacle_poses, strict=True)]
         )
         if self.block >= 0:
-            moved.append((self.block, block_pose))
+            moved.append((self.block, object_pose))
             pybullet.resetBaseVelocity(self.block, (0, 0, 0), (0, 0, 0), **self._client)
-            self._block_position = tuple(block_pose[:3])  # where its weight acts in the next step
+            self._object_position = tuple(object_pose[:3])  # where its weight acts in the next step
         if self.object_joint is not None:
-            position = self._placed_joint.positions(np.array([block_pose], np.float64))[0]
+            position = self._placed_joint.positions(np.array([object_pose], np.float64))[0]
             pybullet.resetJointState(self.object, self.object_joint, position, **self._client)
         for body, (x, y, z, qw, qx, qy, qz) in moved:
             pybullet.resetBasePositionAndOrientation(
@@ -417,7 +417,7 @@ class BulletScene:
                 self.block,
                 -1,
                 self._weight,
-                self._block_position,
+                self._object_position,
                 pybullet.WORLD_FRAME,
                 **self._client,
             )
@@ -443,7 +443,7 @@ class BulletScene:
             return (*pose.tolist(), *(0.0,) * 5, qd)
         position, quaternion = pybullet.getBasePositionAndOrientation(self.block, **self._client)
         linear, angular = pybullet.getBaseVelocity(self.block, **self._client)
-        self._block_position = position
+        self._object_position = position
         return (*position, *quaternion, *linear, *angular)
 
     def close(self) -> None:
@@ -562,12 +562,12 @@ class BulletBatch:
         self,
         rows: NDArray[np.int64],
         q: Float32,
-        block_pose: Float32,
+        object_pose: Float32,
         obstacle_poses: Float32 | None,
     ) -> None:
         """Put scenes at rest and clear their history; see ``Simulation.reset``."""
         all_q, all_qd, poses, velocities = self.state
-        for row, (i, positions, pose) in enumerate(zip(rows.tolist(), q, block_pose, strict=True)):
+        for row, (i, positions, pose) in enumerate(zip(rows.tolist(), q, object_pose, strict=True)):
             scene, span = self._scenes[i], self._spans[i]
             if obstacle_poses is not None:
                 count = len(scene.obstacles)

@@ -67,21 +67,21 @@ class KinematicSimulation(Simulation):
         self._is_joint = self._farthest > 0
         n = len(scenes)
         self.qd = torch.zeros_like(self.q)
-        self.block_pose = torch.zeros(n, 7, device=self.device)
-        self._block_velocity = torch.zeros(n, 3, device=self.device)
+        self.object_pose = torch.zeros(n, 7, device=self.device)
+        self._object_velocity = torch.zeros(n, 3, device=self.device)
         self._diverged = torch.zeros(n, dtype=torch.bool, device=self.device)
         self._on_host = is_host(self.device)
 
     @property
-    def block_velocity(self) -> torch.Tensor:
-        """Zeros; see ``Simulation.block_velocity``."""
-        return self._block_velocity
+    def object_velocity(self) -> torch.Tensor:
+        """Zeros; see ``Simulation.object_velocity``."""
+        return self._object_velocity
 
     def _reset(
         self,
         mask: torch.Tensor,
         q: torch.Tensor,
-        block_pose: torch.Tensor,
+        object_pose: torch.Tensor,
         obstacle_poses: torch.Tensor | None,
     ) -> None:
         rows = mask[:, None]

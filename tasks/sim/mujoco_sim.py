@@ -91,14 +91,14 @@ class MujocoState:
         self._object_joints = ObjectJoints([*objects.values()]) if objects else None
         self._has_blocks = bool((self._pose_at >= 0).any())
         self._joints = np.zeros((2, n, joints), np.float32)
-        self._block_pose = np.zeros((n, 7), np.float32)
+        self._object_pose = np.zeros((n, 7), np.float32)
         self.joints = np.zeros((2, n, joints))
         """Joint positions and velocities at the last ``read``, shape (2, n, J)."""
         self.q, self.qd = map(torch.from_numpy, self._joints)
-        self.block_pose = torch.from_numpy(self._block_pose)
+        self.object_pose = torch.from_numpy(self._object_pose)
 
     @property
-    def block_velocity(self) -> torch.Tensor:
+    def object_velocity(self) -> torch.Tensor:
         """Linear velocities of the blocks at the last ``read``, shape (n, 3)."""
         return torch.from_numpy(self._numbers.flat[self._velocity_at].astype(np.float32))
 
@@ -111,10 +111,10 @@ class MujocoState:
             pose = self._numbers.flat[self._pose_at]
             quaternion = pose[:, 3:]
             quaternion *= np.where(quaternion[:, :1] < 0, -1.0, 1.0)  # w >= 0, as everywhere
-            self._block_pose[:] = pose
+            self._object_pose[:] = pose
         if self._object_joints is not None:
             positions = self._numbers.flat[self._object_at]
-            self._block_pose[self._articulated] = self._object_joints.poses(positions)
+            self._object_pose[self._articulated] = self._object_joints.poses(positions)
 
     def faults(self) -> dict[int, str]:
         """Return the environments that diverged up to the last ``read``, each with the reason."""
@@ -219,7 +219,7 @@ Work = tuple[int, mujoco.MjModel, mujoco.MjData, Array, Array, Array, Array]
 and of its applied forces in the data and in ``PositionControl``."""
 
 
-_VIEWS = {"_state", "q", "qd", "block_pose", "_control", "_work", "_seen", "_warnings", "_pool"}
+_VIEWS = {"_state", "q", "qd", "object_pose", "_control", "_work", "_seen", "_warnings", "_pool"}
 """Attributes that ``_view_data`` makes."""
 
 
@@ -254,7 +254,7 @@ class MujocoSimulation(HostSimulation):
         """Make everything that has views of the data, and the threads."""
         self._state = MujocoState(self._worlds, self._data)
         self.q, self.qd = self._state.q, self._state.qd
-        self.block_pose = self._state.block_pose
+        self.object_pose = self._state.object_pose
         self._control = PositionControl(self._worlds, self._data, self._targets.shape[1])
         self._work: list[Work] = []
         for i, (world, data) in enumerate(zip(self._worlds, self._data, strict=True)):
@@ -277,9 +277,9 @@ class MujocoSimulation(HostSimulation):
         self._state.read()
 
     @property
-    def block_velocity(self) -> torch.Tensor:
-        """Velocities of the blocks; see ``Simulation.block_velocity``."""
-        return self._state.block_velocity
+    def object_velocity(self) -> torch.Tensor:
+        """Velocities of the blocks; see ``Simulation.object_velocity``."""
+        return self._state.object_velocity
 
     def close(self) -> None:
         """Free everything; a second call does nothing."""
@@ -293,7 +293,7 @@ class MujocoSimulation(HostSimulation):
         return np.array(self._data[env].qpos[self._worlds[env].movable_q_at])
 
     def _put(
-        self, envs: NDArray[np.int64], q: Array, block_pose: Array, obstacle_poses: Array | None
+        self, envs: NDArray[np.int64], q: Array, object_pose: Array, obstacle_poses: Array | None
     ) -> None:
         for row, env in enumerate(envs.tolist()):
             world, data = self._worlds[env], self._data[env]
@@ -306,14 +306,14 @@ class MujocoSimulation(HostSimulation):
             positions = q[row, : world.robot.dof].astype(np.float64)
             data.qpos[world.movable_q_at] = movable_positions(world.robot, positions)
             if len(world.block_q_at):
-                pose = block_pose[row].astype(np.float64)
+                pose = object_pose[row].astype(np.float64)
                 if mujoco.mju_normalize4(pose[3:]) < 0.5:  # it returns the length before
                     raise ValueError(
                         f"{self._label(env)}: {pose.tolist()} is not a pose of a block"
                     )
                 data.qpos[world.block_q_at] = pose
             if world.object is not None:
-                pose = block_pose[row : row + 1].astype(np.float64)
+                pose = object_pose[row : row + 1].astype(np.float64)
                 data.qpos[world.object_q_at] = world.object.placed_joint.positions(pose)
             mujoco.mj_kinematics(world.model, data)  # these three give the inertia of controls
             mujoco.mj_comPos(world.model, data)

@@ -217,7 +217,7 @@ def reset_worlds(
     joints: Joints,
     mask: wp.array[wp.uint8],
     q: wp.array2d[float],
-    block_pose: wp.array2d[float],
+    object_pose: wp.array2d[float],
     obstacle_poses: wp.array3d[float],
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
@@ -246,10 +246,10 @@ def reset_worlds(
     overflow[world] = 0
     if joints.block_q_at >= 0:
         for k in range(7):
-            qpos[world, joints.block_q_at + k] = block_pose[env, k]
+            qpos[world, joints.block_q_at + k] = object_pose[env, k]
     if joints.object_q_at >= 0:
         origin, turn, direction, axis = _object(joints, world % joints.object_frame.shape[0])
-        pose = block_pose[env]
+        pose = object_pose[env]
         moved = wp.quat_inverse(turn) * wp.quat(pose[4], pose[5], pose[6], pose[3])
         along = wp.dot(wp.vec3(pose[0], pose[1], pose[2]) - origin, direction)
         angle = 2.0 * wp.atan2(wp.dot(wp.vec3(moved[0], moved[1], moved[2]), axis), moved[3])

@@ -352,7 +352,7 @@ class Group:
     def read(self) -> None:
         """Write the state into the buffers."""
         data, out = self.data, self._buffers
-        outputs = [out[name] for name in ("q", "qd", "block_pose", "block_velocity")]
+        outputs = [out[name] for name in ("q", "qd", "object_pose", "object_velocity")]
         inputs = [self._joints, data.qpos, data.qvel]
         wp.launch(kernels.read_state, data.nworld, inputs, outputs)
 
@@ -474,7 +474,7 @@ class WarpSimulation(Simulation):
         found = structures(self.scenes, compiled)
         n, joints = len(scenes), max(world.robot.dof for world in compiled)
         shapes = dict.fromkeys(("q", "qd", "targets", "reset_q"), (n, joints))
-        shapes |= {"block_pose": (n, 7), "reset_pose": (n, 7), "block_velocity": (n, 3)}
+        shapes |= {"object_pose": (n, 7), "reset_pose": (n, 7), "object_velocity": (n, 3)}
         tensors = {name: torch.zeros(shape, device=self.device) for name, shape in shapes.items()}
         for name, shape, dtype in (
             ("counts", (len(found), 2), torch.int32),
@@ -483,7 +483,7 @@ class WarpSimulation(Simulation):
             ("mask", (n,), torch.uint8),
         ):
             tensors[name] = torch.zeros(shape, dtype=dtype, device=self.device)
-        self.q, self.qd, self.block_pose = (tensors[name] for name in ("q", "qd", "block_pose"))
+        self.q, self.qd, self.object_pose = (tensors[name] for name in ("q", "qd", "object_pose"))
         self.counts, self._tensors = tensors["counts"], tensors
         self._obstacle_poses = torch.zeros(n, self._num_obstacles, 7, device=self.device)
         buffers = {name: wp.from_torch(tensor) for name, tensor in tensors.items()}
@@ -498,20 +498,20 @@ class WarpSimulation(Simulation):
         self.counts.zero_()  # capturing ran steps
 
     @property
-    def block_velocity(self) -> torch.Tensor:
-        """Velocities of the blocks; see ``Simulation.block_velocity``."""
-        return self._tensors["block_velocity"]
+    def object_velocity(self) -> torch.Tensor:
+        """Velocities of the blocks; see ``Simulation.object_velocity``."""
+        return self._tensors["object_velocity"]
 
     def _reset(
         self,
         mask: torch.Tensor,
         q: torch.Tensor,
-        block_pose: torch.Tensor,
+        object_pose: torch.Tensor,
         obstacle_poses: torch.Tensor | None,
     ) -> None:
         self._tensors["mask"].copy_(mask)
         self._tensors["reset_q"].copy_(q)
-        self._tensors["reset_pose"].copy_(block_pose)
+        self._tensors["reset_pose"].copy_(object_pose)
         if obstacle_poses is not None:
             self._obstacle_poses.copy_(obstacle_poses)
         poses = self._no_poses if obstacle_poses is None else self._poses

@@ -65,7 +65,7 @@ class OnALine:
             score=-distance,
             terms=terms,
             q=q[:, None],
-            block_pose=torch.zeros(self.num_envs, 7),
+            object_pose=torch.zeros(self.num_envs, 7),
         )
 
     def observe(self):

@@ -3,7 +3,7 @@
 import torch
 
 
-def reset_envs(simulation, envs, q, block_pose=None, obstacle_poses=None):
+def reset_envs(simulation, envs, q, object_pose=None, obstacle_poses=None):
     """Reset environments with these indices; the other arguments have a row for each of them."""
     n = len(simulation.scenes)
     rows = torch.as_tensor(envs).to(simulation.device)
@@ -15,14 +15,14 @@ def reset_envs(simulation, envs, q, block_pose=None, obstacle_poses=None):
         filled[rows] = torch.as_tensor(values, dtype=torch.float32).to(simulation.device)
         return filled
 
-    block_pose = torch.zeros(len(rows), 7) if block_pose is None else block_pose
+    object_pose = torch.zeros(len(rows), 7) if object_pose is None else object_pose
     obstacles = () if obstacle_poses is None else (of_all(obstacle_poses),)
-    simulation.reset(mask, of_all(q), of_all(block_pose), *obstacles)
+    simulation.reset(mask, of_all(q), of_all(object_pose), *obstacles)
 
 
 def homes(simulation):
     """Return the joint positions at home and the poses of the blocks, (n, J) and (n, 7)."""
-    q, poses = torch.zeros_like(simulation.q), torch.zeros_like(simulation.block_pose)
+    q, poses = torch.zeros_like(simulation.q), torch.zeros_like(simulation.object_pose)
     for env, scene in enumerate(simulation.scenes):
         q[env, : scene.robot.dof] = torch.tensor(scene.robot.home)
         if scene.block is not None:
@@ -39,5 +39,5 @@ def put_home(simulation, envs=None):
 
 def state(simulation):
     """Return copies of all reported state, a row for each environment."""
-    parts = (simulation.q, simulation.qd, simulation.block_pose, simulation.block_velocity)
+    parts = (simulation.q, simulation.qd, simulation.object_pose, simulation.object_velocity)
     return torch.cat(parts, dim=1).clone()

@@ -235,7 +235,7 @@ def test_a_block_that_slips_away_is_replanned(tmp_path, monkeypatch):
     task.reset()
     for i in range(PUSH.max_episode_steps):
         if i % 60 == 59:
-            away = task.simulation.block_pose.clone()
+            away = task.simulation.object_pose.clone()
             away[0, 0] = -away[0, 0] + (0.15 if away[0, 0] < 0 else -0.15)
             away[0, 1] = -0.2
             reset_envs(task.simulation, [0], task.simulation.q.clone(), away)

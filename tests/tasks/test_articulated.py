@@ -26,7 +26,7 @@ def pushed(name, *objects):
     for step in range(150):
         target = torch.full((len(scenes), 1), -0.2 + min(step / 100, 1.0) * 0.4)
         assert not simulation.step(target).any(), simulation.faults()
-    positions = ObjectJoints(objects).positions(simulation.block_pose.double().numpy())
+    positions = ObjectJoints(objects).positions(simulation.object_pose.double().numpy())
     rods = simulation.q[:, 0].numpy().copy()
     simulation.close()
     return positions, rods
@@ -59,11 +59,11 @@ def test_reset_by_mask_restores_the_joint(name, opened):
     mask = torch.tensor([True, False, True, False])
     poses = torch.tensor(joints.poses(wanted), dtype=torch.float32)
     simulation.reset(mask, torch.full((4, 1), -0.2), poses)
-    found = joints.positions(simulation.block_pose.double().numpy())
+    found = joints.positions(simulation.object_pose.double().numpy())
     assert found == pytest.approx(np.where(mask.numpy(), wanted, 0.0), abs=1e-5)
-    assert simulation.block_pose[:3:2].numpy() == pytest.approx(poses[:3:2].numpy(), abs=1e-6)
+    assert simulation.object_pose[:3:2].numpy() == pytest.approx(poses[:3:2].numpy(), abs=1e-6)
     simulation.step(torch.full((4, 1), -0.2))
-    rested = joints.positions(simulation.block_pose.double().numpy())
+    rested = joints.positions(simulation.object_pose.double().numpy())
     assert rested == pytest.approx(found, abs=1e-3)  # nothing pushes, and its weight is carried
 
 

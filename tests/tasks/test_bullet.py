@@ -180,14 +180,14 @@ def test_friction_follows_coulombs_law(simulate, friction, degrees):
     simulation = simulate(block_scene(friction, height=0.025))
     q = reset(simulation)
     simulation.step(q)
-    before = simulation.block_pose[0, :2].clone()
+    before = simulation.object_pose[0, :2].clone()
     loaded = client_of(simulation)
     ahead = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
     pybullet.resetBaseVelocity(loaded.block, (*0.8 * ahead, 0.0), physicsClientId=loaded.id)
     for _ in range(60):
         simulation.step(q)
     expected = 0.8**2 / (2 * friction * GRAVITY) * ahead
-    moved = (simulation.block_pose[0, :2] - before).numpy()
+    moved = (simulation.object_pose[0, :2] - before).numpy()
     np.testing.assert_allclose(moved, expected, atol=0.05 * np.linalg.norm(expected))
 
 
@@ -205,8 +205,8 @@ def test_plate_passes_through_the_block_without_contacts(simulate):
         q[:, 1] += 0.008
         simulation.step(q)
     assert float(simulation.q[0, 1]) > 0.2
-    assert float(simulation.block_pose[0, 1]) == pytest.approx(0.0, abs=1e-3)
-    assert float(simulation.block_pose[0, 2]) == pytest.approx(0.075, abs=1e-3)
+    assert float(simulation.object_pose[0, 1]) == pytest.approx(0.0, abs=1e-3)
+    assert float(simulation.object_pose[0, 2]) == pytest.approx(0.075, abs=1e-3)
 
 
 def test_fixed_base_touches_blocks_but_not_static_objects(simulate):

@@ -205,7 +205,7 @@ def test_a_diverged_environment_is_reset_once_and_the_step_undone(specs):
     step = batch.step(torch.ones(batch.action_mask.shape))
     assert step.diverged.tolist() == step.truncated.tolist() == [False, True, False]
     assert torch.equal(step.q[1], before.q[1])
-    assert torch.equal(step.block_pose[1], before.block_pose[1])
+    assert torch.equal(step.object_pose[1], before.object_pose[1])
     assert (batch.simulation.resets - resets).tolist() == [0, 1, 0]
     for part in (step.observation, step.final_observation):
         assert all(values.float().isfinite().all() for values in part.values())
@@ -335,7 +335,7 @@ def test_starts_and_goals_are_free_in_their_layout(build_layouts):
         goal = batch.groups["reach"].goal_configuration[0, : batch.specs[0].robot.dof]
         start = batch.q[0, : batch.specs[0].robot.dof]
         assert reach.free(torch.stack([goal, start]).double().numpy()).all()
-        block = batch.simulation.block_pose[1:].double().numpy()
+        block = batch.simulation.object_pose[1:].double().numpy()
         assert push.free(batch.q[1:, : batch.specs[1].robot.dof].double().numpy(), block).all()
         assert push.block_is_clear(block).all()
 
@@ -446,7 +446,7 @@ def test_returned_tensors_are_copies(build_batch):
         parts = {"now": step.observation, "final": step.final_observation, "terms": step.terms}
         plain = ("reward", "terminated", "truncated", "diverged", "success", "distance", "score")
         named = {f"{of} {k}": v for of, part in parts.items() for k, v in part.items()}
-        return named | {k: getattr(step, k) for k in (*plain, "q", "block_pose")}
+        return named | {k: getattr(step, k) for k in (*plain, "q", "object_pose")}
 
     def spoil(values):
         for each in values:

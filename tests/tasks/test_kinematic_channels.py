@@ -186,7 +186,7 @@ def test_push_observes_the_block_from_the_nearest_point_of_the_robot(tmp_path):
     moving = observation["jacobian"][..., 6] > 0
     distance = torch.linalg.vector_norm(offset[moving] / POSITION_SCALE, dim=-1)
     tool = batch.observation.tool_positions(batch.q)
-    to_block = torch.linalg.vector_norm(tool - batch.simulation.block_pose[:, :3], dim=1)
+    to_block = torch.linalg.vector_norm(tool - batch.simulation.object_pose[:, :3], dim=1)
     assert (distance <= to_block.max() + 1e-4).all()
     assert (distance > 0).all()
 
@@ -292,7 +292,7 @@ def test_goals_that_are_poses_are_solved_with_their_orientation(specs):
     q = solution_of(batch, batch.reset())
     near = distance_to_goal(batch, q) < SOLVED
     T_root_tool = frame_pose(batch.robot_tables.tool_chain, batch.env_robot_index, q)
-    wanted = batch.groups.tool_targets(batch.simulation.block_pose).rotations
+    wanted = batch.groups.tool_targets(batch.simulation.object_pose).rotations
     trace = (wanted * T_root_tool[:, :3, :3]).sum(dim=(1, 2))
     angle = torch.arccos(((trace - 1) / 2).clamp(-1, 1))
     # Most poses are found, not all.

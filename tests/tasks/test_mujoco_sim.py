@@ -178,9 +178,9 @@ def test_friction_is_that_of_the_block(friction):
             [block_scene(block, obstacles=(Block((2, 4, 0.1), ramp, friction=0.9),))]
         )
         held(sim, 50)
-        before = sim.block_pose[0, :3].clone()
+        before = sim.object_pose[0, :3].clone()
         held(sim, 25)
-        travelled.append((sim.block_pose[0, :3] - before).norm().item())
+        travelled.append((sim.object_pose[0, :3] - before).norm().item())
     slide = GRAVITY * (math.sin(angle) - friction * math.cos(angle))
     assert travelled[0] < 1e-3
     assert travelled[1] == pytest.approx(slide / 2 * (1.5**2 - 1), rel=0.05)

@@ -177,7 +177,7 @@ def test_snapshot_is_one_environment_of_a_batch(cache):
     batch.reset()
     reaching, pushing = render_state(batch, 0), render_state(batch, 1)
     assert reaching.block is None
-    assert np.array_equal(pushing.block, batch.simulation.block_pose[1].numpy())
+    assert np.array_equal(pushing.block, batch.simulation.object_pose[1].numpy())
     assert np.array_equal(reaching.markers["goal"], batch.field("goal")[0].numpy())
     for env, now in enumerate((reaching, pushing)):
         assert len(now.q) == batch.specs[env].robot.dof

@@ -93,9 +93,9 @@ def test_states_are_at_home_and_padded(load, scenes):
     q, poses = homes(sim)
     assert torch.equal(sim.q, q)
     assert sim.q.shape == sim.qd.shape == (3, 9)
-    torch.testing.assert_close(sim.block_pose, poses)
-    assert sim.block_velocity.shape == (3, 3)
-    assert sim.q.dtype == sim.block_pose.dtype == torch.float32
+    torch.testing.assert_close(sim.object_pose, poses)
+    assert sim.object_velocity.shape == (3, 3)
+    assert sim.q.dtype == sim.object_pose.dtype == torch.float32
     targets = q.clone()
     targets[1, 5:] = torch.nan  # padding is ignored
     assert not sim.step(targets).any()
@@ -140,8 +140,8 @@ def test_environments_give_the_same_bits_alone_and_in_a_batch(load, scenes):
         for same in (env, env + 3):
             assert torch.equal(together.q[same, :dof], alone.q[0])
             assert torch.equal(together.qd[same, :dof], alone.qd[0])
-            assert torch.equal(together.block_pose[same], alone.block_pose[0])
-            assert torch.equal(together.block_velocity[same], alone.block_velocity[0])
+            assert torch.equal(together.object_pose[same], alone.object_pose[0])
+            assert torch.equal(together.object_velocity[same], alone.object_velocity[0])
 
 
 @pytest.mark.parametrize("sim", WITH_CONTACTS)
@@ -268,11 +268,11 @@ def block_scene(height):
 def test_blocks_fall_freely_and_come_to_rest(load):
     sim = held(load(block_scene(1.0)), 10)
     fallen = GRAVITY * TIMESTEP**2 * 40 * 41 / 2
-    assert sim.block_pose[0, 2] == pytest.approx(1.0 - fallen, abs=1e-5)
-    assert sim.block_velocity[0, 2] == pytest.approx(-GRAVITY * 0.2, rel=1e-5)
+    assert sim.object_pose[0, 2] == pytest.approx(1.0 - fallen, abs=1e-5)
+    assert sim.object_velocity[0, 2] == pytest.approx(-GRAVITY * 0.2, rel=1e-5)
     held(sim, 100)
-    assert sim.block_pose[0, 2] == pytest.approx(0.05, abs=1e-3)
-    assert sim.block_velocity.abs().max() < 1e-3
+    assert sim.object_pose[0, 2] == pytest.approx(0.05, abs=1e-3)
+    assert sim.object_velocity.abs().max() < 1e-3
 
 
 SOME = ("arm=ur5 ee=plane", "arm=panda ee=panda_hand", "arm3", "prims", "chain beads=2")
@@ -299,7 +299,7 @@ def test_tool_paths_agree_in_free_space(load_both, words):
 
 
 def assert_blocks_agree(sims):
-    ends = [sim.block_pose[0] for sim in sims]
+    ends = [sim.object_pose[0] for sim in sims]
     assert (ends[0][:3] - ends[1][:3]).norm() < 0.02
     assert (ends[0][3:] * ends[1][3:]).sum().abs() > 0.995
 
@@ -314,8 +314,8 @@ def test_dropped_blocks_come_to_rest_at_the_same_pose(load_both, edge, mass, tur
     sims = load_both(Scene(robot("prims"), Pose((5, 0, 0)), Block((edge,) * 3, start, mass)))
     for sim in sims:
         held(sim, 2 * SECOND)
-        assert sim.block_velocity.abs().max() < 0.01
-        assert sim.block_pose[0, 2].item() == pytest.approx(edge / 2, abs=1e-3)
+        assert sim.object_velocity.abs().max() < 0.01
+        assert sim.object_pose[0, 2].item() == pytest.approx(edge / 2, abs=1e-3)
     assert_blocks_agree(sims)
 
 
@@ -332,7 +332,7 @@ def test_pushed_blocks_move_the_same_distance(load_both, friction, aside):
         for _ in range(2 * SECOND):
             target[0, 1] += 0.2 * CONTROL_PERIOD
             sim.step(target)
-    assert sims[0].block_pose[0, 1] > 0.2
+    assert sims[0].object_pose[0, 1] > 0.2
     assert_blocks_agree(sims)
 
 
@@ -348,7 +348,7 @@ def pushed(load, block_mass, speed, way, finger_mass=2.0):
     for _ in range(round((way + 0.004) / speed / CONTROL_PERIOD)):
         q[:, 0] += speed * CONTROL_PERIOD
         sim.step(q)
-        _, _, z, _, x, y, _ = sim.block_pose[0].tolist()
+        _, _, z, _, x, y, _ = sim.object_pose[0].tolist()
         tilt = np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1))
         rows.append((float(q[0, 0] - sim.q[0, 0]), z - EDGE / 2, tilt))
     return sim, np.array(rows)
@@ -367,7 +367,7 @@ def test_finger_deflection_matches_its_stiffness(load, block_mass, finger_mass):
 @pytest.mark.parametrize("sim", WITH_CONTACTS)
 def test_pushed_block_stays_on_the_ground(load):
     sim, rows = pushed(load, 0.1, 0.3, 0.25)
-    assert sim.block_pose[0, 1] > 0.2
+    assert sim.object_pose[0, 1] > 0.2
     assert rows[:, 1].max() < 1e-3
     assert np.degrees(rows[:, 2].max()) < 3
 
@@ -463,12 +463,12 @@ def test_a_moved_obstacle_gives_the_bits_of_a_loaded_one(load):
     loaded, moved = (load(scene) for scene in scenes)
     row = np.array([*pose.position, *pose.quaternion], np.float32)
     poses, start = torch.from_numpy(row)[None, None], torch.tensor([[0.0, 0.25]])
-    block_pose = torch.tensor([[0.25, 0.25, 0.0625, 1.0, 0.0, 0.0, 0.0]])
+    object_pose = torch.tensor([[0.25, 0.25, 0.0625, 1.0, 0.0, 0.0, 0.0]])
     for simulation in (loaded, moved):
-        reset_envs(simulation, [0], start, block_pose, poses)
+        reset_envs(simulation, [0], start, object_pose, poses)
     for step in range(50):
         for simulation in (loaded, moved):
             simulation.step(torch.tensor([[0.02 * step, 0.25]]))
     assert torch.equal(loaded.q, moved.q)
-    assert torch.equal(loaded.block_pose, moved.block_pose)
-    assert loaded.block_pose[0, 0] > 0.3
+    assert torch.equal(loaded.object_pose, moved.object_pose)
+    assert loaded.object_pose[0, 0] > 0.3

@@ -27,8 +27,8 @@ class HoverConfig(ReachConfig):
 class HoverEnvs(ReachEnvs):
     """Environments of reach with another field."""
 
-    def observe(self, block_pose):
-        return {**super().observe(block_pose), "extra": self.goal[:, :1]}
+    def observe(self, object_pose):
+        return {**super().observe(object_pose), "extra": self.goal[:, :1]}
 
 
 @pytest.fixture

@@ -221,12 +221,12 @@ def test_dropped_blocks_spin_and_come_to_rest_as_in_mujoco():
     for _ in range(15):
         ours.step(ours.q)
         mujoco.step(mujoco.q)
-        assert torch.allclose(ours.block_velocity, mujoco.block_velocity, atol=0.02)
+        assert torch.allclose(ours.object_velocity, mujoco.object_velocity, atol=0.02)
     for _ in range(SECOND):
         ours.step(ours.q)
         mujoco.step(mujoco.q)
-    assert torch.allclose(ours.block_pose, mujoco.block_pose, atol=2e-3)
-    assert ours.block_velocity.abs().max() < 0.01
+    assert torch.allclose(ours.object_pose, mujoco.object_pose, atol=2e-3)
+    assert ours.object_velocity.abs().max() < 0.01
 
 
 def table(height):
@@ -250,19 +250,19 @@ def test_static_shapes_are_where_each_robot_of_a_structure_has_them():
     for _ in range(SECOND):
         sim.step(sim.q)
     tops = torch.tensor([height + 0.05 for height in heights])
-    assert torch.allclose(sim.block_pose[:, 2], tops, atol=1e-3)
+    assert torch.allclose(sim.object_pose[:, 2], tops, atol=1e-3)
 
 
 def test_a_reset_moves_obstacles_and_blocks():
     sim = simulation([push_scene()])
-    assert torch.allclose(sim.block_pose, homes(sim)[1])
+    assert torch.allclose(sim.object_pose, homes(sim)[1])
     poses = torch.tensor([[[-2.0, 0.0, 0.3, 1, 0, 0, 0], [2.0, 0.2, 0.1, 1, 0, 0, 0]]])
     block = torch.tensor([[2.0, 0.2, 0.4, 0.0, 0, 0, -1.0]])
     sim.reset(torch.tensor([True]), sim.q.clone(), block, poses)
-    assert torch.allclose(sim.block_pose, block)
+    assert torch.allclose(sim.object_pose, block)
     for _ in range(SECOND):
         sim.step(sim.q)
-    assert sim.block_pose[0, 2] == pytest.approx(0.2 + 0.075, abs=0.002)  # on the obstacle
+    assert sim.object_pose[0, 2] == pytest.approx(0.2 + 0.075, abs=0.002)  # on the obstacle
 
 
 def test_without_a_gpu_the_simulator_is_refused_by_name():
