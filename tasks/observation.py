@@ -343,7 +343,9 @@ _NUMBERS = 8
 
 
 class PointClouds:
-    """P points on the surfaces of every environment's block and obstacles.
+    """P points on the surfaces of every environment's object and obstacles.
+
+    Of an articulated object they are on the box around the shape that tools push.
 
     Each episode draws its points and their noise at its beginning, uniformly over all surfaces.
 
@@ -356,14 +358,14 @@ class PointClouds:
         n, num_obstacles = len(scenes), max(len(scene.obstacles) for scene in scenes)
         self._local = torch.zeros(n, num_points, 3, device=device)
         self._on_block = torch.zeros(n, num_points, dtype=torch.bool, device=device)
-        # Box 0 is the block, and the others are the obstacles; missing ones have no size.
-        sizes = torch.zeros(n, 1 + num_obstacles, 3)
+        # Box 0 is the object, and the others are the obstacles; missing ones have no size.
+        sizes, centres = torch.zeros(n, 1 + num_obstacles, 3), torch.zeros(n, 3)
         for i, scene in enumerate(scenes):
-            if scene.block is not None:
-                sizes[i, 0] = torch.tensor(scene.block.size)
+            if scene.object_box is not None:
+                sizes[i, 0], centres[i] = torch.tensor(scene.object_box)
             for k, box in enumerate(scene.obstacles, start=1):
                 sizes[i, k] = torch.tensor(box.size)
-        self._sizes = sizes.to(device)
+        self._sizes, self._centre = sizes.to(device), centres[:, None].to(device)
         x, y, z = sizes.double().unbind(2)
         # Areas of the faces across x, y and z of all boxes, added up, as fractions of their sum.
         areas = torch.stack([y * z, x * z, x * y], dim=2).flatten(1).cumsum(dim=1)
@@ -386,6 +388,7 @@ class PointClouds:
         rows = torch.arange(n, device=axis.device)[:, None]
         local = position * self._sizes[rows, box] + NOISE * _normal(numbers[..., 4:])[..., :3]
         on_block = box == 0
+        local = torch.where(on_block[..., None], local + self._centre, local)
         if obstacle_poses.shape[1]:
             pose = obstacle_poses[rows, (box - 1).clamp(min=0)]
             R = matrix_from_quaternion(pose[..., 3:])

@@ -10,9 +10,10 @@ import numpy as np
 
 from morphgen.errors import SimulationError
 from morphgen.model.geometry import IDENTITY, Mesh, Pose, Shape
+from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics
-from morphgen.model.robot import Inertial, Joint, Robot
-from morphgen.model.rotation import rotate
+from morphgen.model.robot import TOOL, Inertial, Joint, Robot
+from morphgen.model.rotation import Vec3, rotate
 from morphgen.model.tree import RigidGroup, rigid_groups
 from morphgen.tasks.sim.rigid_bodies import merged_inertial
 from morphgen.typing import Array
@@ -22,7 +23,8 @@ from morphgen.typing import Array
 class ArticulatedObject:
     """An object that stands in a scene, and of which one link moves: a drawer, a door, a dial.
 
-    Its state is the pose of the link that moves, as the state of a block is the pose of the block.
+    Its state is a pose, as that of a block: the position of its contact point, and the rotation of
+    the link that moves.
     """
 
     body: Robot
@@ -45,6 +47,11 @@ class ArticulatedObject:
             )
         if self.moving_inertial is None:
             raise SimulationError(f"object {self.body.name!r}: the link that moves has no mass")
+        if self._contact_link not in self._moving_links:
+            raise SimulationError(
+                f"object {self.body.name!r}: the link {self._contact_link!r} of its frame "
+                f"{TOOL!r} does not move"
+            )
         for shape in (*self.base_shapes, *self.moving_shapes):
             if isinstance(shape.geometry, Mesh):
                 raise SimulationError(
@@ -73,6 +80,46 @@ class ArticulatedObject:
     def moving_shapes(self) -> tuple[Shape, ...]:
         """Collision shapes that move, in the frame of the link below the joint."""
         return self._shapes(rigid_groups(self.body)[1], self.joint.T_parent_joint)
+
+    @cached_property
+    def contact(self) -> Vec3:
+        """Point where tools push, in the frame below the joint: the frame ``tool``, or its origin.
+
+        The position of the object's state is that of this point.
+        """
+        frames = [frame for frame in self.body.frames if frame.name == TOOL]
+        if not frames:
+            return (0.0, 0.0, 0.0)
+        T_root_link = self._poses[self.body.link_index[frames[0].link]]
+        T_joint_root = self.joint.T_parent_joint.inverse()
+        return (T_joint_root @ T_root_link @ frames[0].T_link_frame).position
+
+    @cached_property
+    def contact_shapes(self) -> tuple[Shape, ...]:
+        """Collision shapes that move, in the frame of the state: from the contact point."""
+        T_contact_joint = Pose(self.contact).inverse()
+        return tuple(
+            replace(shape, T_link_shape=T_contact_joint @ shape.T_link_shape)
+            for shape in self.moving_shapes
+        )
+
+    @cached_property
+    def contact_box(self) -> tuple[Vec3, Vec3]:
+        """Edges and centre of a box around the shape at the contact point, in that frame."""
+        boxes = [bounding_box((shape,)) for shape in self.contact_shapes]
+        outside = [float(np.maximum(np.maximum(low, -high), 0).sum()) for low, high in boxes]
+        low, high = boxes[int(np.argmin(outside))]
+        return tuple((high - low).tolist()), tuple(((high + low) / 2).tolist())
+
+    @property
+    def _contact_link(self) -> str:
+        """Link of the contact point."""
+        links = [frame.link for frame in self.body.frames if frame.name == TOOL]
+        return links[0] if links else self.joint.child
+
+    @property
+    def _moving_links(self) -> set[str]:
+        return {link.name for link in rigid_groups(self.body)[1].links}
 
     @cached_property
     def moving_inertial(self) -> Inertial | None:
@@ -106,42 +153,58 @@ class ArticulatedObject:
 
 
 class ObjectJoints:
-    """Joints of k articulated objects: poses of their links that move, from positions and back."""
+    """Joints of k articulated objects: their states from positions of the joints, and back."""
 
     def __init__(self, objects: Sequence[ArticulatedObject]) -> None:
         """Gather the joints' frames at zero in the world.
 
         Attributes:
-            frame: Their poses, shape (k, 7).
+            frame: Their poses, shape (k, 7); those of slides are at the contact points.
+            offset: Contact points in frames of hinges, shape (k, 3); zeros for slides.
             direction: Their axes in the world, shape (k, 3).
             axis: Their axes in their own frames, shape (k, 3).
             is_slide: Whether each is prismatic, shape (k,), bool.
         """
-        frames = [each.pose @ each.joint.T_parent_joint for each in objects]
+        self.is_slide = np.array([each.joint.kind == "prismatic" for each in objects])
+        contact = np.array([each.contact for each in objects])
+        self.offset = np.where(self.is_slide[:, None], 0.0, contact)
+        frames = [
+            each.pose
+            @ each.joint.T_parent_joint
+            @ Pose(each.contact if is_slide else IDENTITY.position)
+            for each, is_slide in zip(objects, self.is_slide, strict=True)
+        ]
         axes = [each.joint.unit_axis for each in objects]
         self.frame = np.array([(*pose.position, *pose.quaternion) for pose in frames])
         self.axis = np.array(axes)
         self.direction = np.array(
             [rotate(pose.quaternion, axis) for pose, axis in zip(frames, axes, strict=True)]
         )
-        self.is_slide = np.array([each.joint.kind == "prismatic" for each in objects])
 
     def poses(self, q: Array) -> Array:
-        """Return the poses (k, 7) of the links that move at joint positions (k,) [rad or m]."""
+        """Return the states (k, 7) of the objects at joint positions (k,) [rad or m]."""
         slide = np.where(self.is_slide, q, 0.0)[:, None]
         half = np.where(self.is_slide, 0.0, q)[:, None] / 2
         turn = np.concatenate([np.cos(half), np.sin(half) * self.axis], axis=1)
         quaternion = _product(self.frame[:, 3:], turn)
         quaternion *= np.where(quaternion[:, :1] < 0, -1.0, 1.0)
-        return np.concatenate([self.frame[:, :3] + slide * self.direction, quaternion], axis=1)
+        contact = self.frame[:, :3] + slide * self.direction + _rotated(quaternion, self.offset)
+        return np.concatenate([contact, quaternion], axis=1)
 
     def positions(self, poses: Array) -> Array:
-        """Return the joint positions (k,) of links at poses (k, 7); angles are within a turn."""
+        """Return the joint positions (k,) of objects in states (k, 7); angles are within a turn."""
         along = ((poses[:, :3] - self.frame[:, :3]) * self.direction).sum(axis=1)
         turn = _product(self.frame[:, 3:] * (1.0, -1.0, -1.0, -1.0), poses[:, 3:])
         angle = 2 * np.arctan2((turn[:, 1:] * self.axis).sum(axis=1), turn[:, 0])
         angle = (angle + np.pi) % (2 * np.pi) - np.pi
         return np.asarray(np.where(self.is_slide, along, angle))
+
+
+def _rotated(quaternions: Array, vectors: Array) -> Array:
+    """Return vectors (k, 3) turned by quaternions (k, 4)."""
+    w, xyz = quaternions[:, :1], quaternions[:, 1:]
+    twice = 2 * np.cross(xyz, vectors)
+    return np.asarray(vectors + w * twice + np.cross(xyz, twice))
 
 
 def _product(a: Array, b: Array) -> Array:

@@ -76,14 +76,21 @@ class Scene:
 
     @property
     def object_shapes(self) -> tuple[Shape, ...]:
-        """Collision shapes of the object, or of its link that moves; none without one."""
+        """Collision shapes of the object that move, in the frame of its pose; none without one."""
         if isinstance(self.object, ArticulatedObject):
-            return self.object.moving_shapes
+            return self.object.contact_shapes
         return () if self.object is None else (Shape(Box(self.object.size)),)
 
     @property
+    def object_box(self) -> tuple[Vec3, Vec3] | None:
+        """Edges of the block and zeros, or ``ArticulatedObject.contact_box``; None without one."""
+        if isinstance(self.object, ArticulatedObject):
+            return self.object.contact_box
+        return None if self.object is None else (self.object.size, (0.0, 0.0, 0.0))
+
+    @property
     def object_pose(self) -> Pose | None:
-        """Pose in the world of the object, or of its link that moves, at home; None without one."""
+        """Pose of the object in the world at home, as ``Simulation.object_pose``; None without."""
         if not isinstance(self.object, ArticulatedObject):
             return None if self.object is None else self.object.pose
         home = np.array(self.object.body.home)
@@ -126,7 +133,7 @@ class Simulation(ABC):
     qd: torch.Tensor
     """Velocities of the independent joints, shape (n, J) [rad/s or m/s]."""
     object_pose: torch.Tensor
-    """Poses in the world of the blocks, or of the links of articulated objects that move, which
+    """Poses in the world of the blocks, or of articulated objects at their contact points, which
     determine their joints: x, y, z, qw, qx, qy, qz, (n, 7); zeros without an object."""
 
     def __init__(self, scenes: Sequence[Scene], device: torch.device) -> None:

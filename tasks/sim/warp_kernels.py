@@ -42,7 +42,7 @@ class Joints:
     object_frame: wp.array2d[float]
     """Pose in the world of the joint's frame at zero: x, y, z, qw, qx, qy, qz, (R, 7)."""
     object_axis: wp.array2d[float]
-    """Axis of the joint in the world, then in its own frame, (R, 6)."""
+    """Axis of the joint in the world, then in its own frame; contact point of a hinge, (R, 9)."""
     obstacles: wp.array[int]  # indices in `mocap_pos` of the obstacles
 
 
@@ -159,6 +159,8 @@ def read_state(
             half = wp.sin(position / 2.0)
             moved = wp.quat(half * axis[0], half * axis[1], half * axis[2], wp.cos(position / 2.0))
             turn = turn * moved
+            offset = joints.object_axis[row]
+            origin += wp.quat_rotate(turn, wp.vec3(offset[6], offset[7], offset[8]))
         side = wp.where(turn[3] < 0.0, -1.0, 1.0)
         out_pose[env, 3] = side * turn[3]
         for k in range(3):

@@ -427,7 +427,7 @@ def _joints(structure: Structure) -> kernels.Joints:
         moved = ObjectJoints(objects)
         joints.object_is_slide = int(moved.is_slide[0])
         joints.object_frame = _array(moved.frame, float)
-        joints.object_axis = _array(np.hstack([moved.direction, moved.axis]), float)
+        joints.object_axis = _array(np.hstack([moved.direction, moved.axis, moved.offset]), float)
     joints.obstacles = _array(first.obstacles, int)
     return joints
 

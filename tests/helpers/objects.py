@@ -3,11 +3,12 @@
 from dataclasses import replace
 
 from morphgen.model.geometry import IDENTITY, Box, Cylinder, Pose, Shape
-from morphgen.model.robot import Inertial, Joint, Link, Robot
+from morphgen.model.robot import TOOL, Frame, Inertial, Joint, Link, Robot
 from morphgen.tasks.sim.articulated import ArticulatedObject
 
 SOLID = (0.01, 0.0, 0.0, 0.01, 0.0, 0.01)
 AT = Pose((0.0, 0.0, 0.2))
+EDGE = Pose((0.24, 0.01, 0.05))
 HINGED = Pose((-0.2, 0.0, 0.0))
 POST = Shape(Box((0.05, 0.05, 0.4)), Pose((0.4, 0.0, 0.2)))
 """A part of each object that stands still."""
@@ -21,11 +22,12 @@ def drawer(pose=IDENTITY):
 
 
 def door(pose=HINGED):
-    """A panel, which turns about z to either side."""
+    """A panel, which turns about z to either side, pushed near its free edge."""
     middle = Pose((0.15, 0.0, 0.0))
     panel = (Shape(Box((0.3, 0.02, 0.2)), middle),)
     joint = Joint("hinge", "revolute", "case", "panel", AT, (0.0, 0.0, 1.0), (-1.5, 1.5))
-    return _object("door", replace(joint, damping=0.1, friction=0.1), panel, middle, pose)
+    edge = Frame(TOOL, "panel", EDGE)
+    return _object("door", replace(joint, damping=0.1, friction=0.1), panel, middle, pose, edge)
 
 
 def rod():
@@ -41,9 +43,9 @@ def rod():
     )
 
 
-def _object(name, joint, shapes, centre, pose):
+def _object(name, joint, shapes, centre, pose, *frames):
     links = (
         Link("case", Inertial(1.0, inertia=SOLID), collisions=(POST,)),
         Link(joint.child, Inertial(0.5, centre.position, SOLID), collisions=shapes),
     )
-    return ArticulatedObject(Robot(name, links, (joint,), home=(0.0,)), pose)
+    return ArticulatedObject(Robot(name, links, (joint,), frames, home=(0.0,)), pose)

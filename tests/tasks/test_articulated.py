@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.objects import POST, door, drawer, rod
+from helpers.objects import AT, EDGE, POST, door, drawer, rod
 from helpers.simulators import PYBULLET
 from morphgen.errors import SimulationError
 from morphgen.model.geometry import Box, Mesh, Pose, Shape
+from morphgen.model.robot import TOOL, Frame
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.registry import SIMULATORS
 from morphgen.tasks.sim.articulated import ArticulatedObject, ObjectJoints
@@ -96,6 +97,8 @@ def faulty(fault):
         second = replace(body.joints[0], name="second", parent="front", child="end")
         links = (case, front, replace(front, name="end"))
         return replace(body, links=links, joints=(*body.joints, second), home=(0.0, 0.0))
+    if fault == "frame":
+        return replace(body, frames=(Frame(TOOL, "case"),))
     if fault == "mesh":
         return replace(body, links=(replace(case, collisions=(Shape(Mesh("none.stl")),)), front))
     return replace(body, links=(case, replace(front, inertial=None)))
@@ -106,6 +109,7 @@ def faulty(fault):
     [
         ("joints", "'drawer' has 2 movable joints; expected one"),
         ("mesh", "'drawer' has a mesh for collisions; expected primitives"),
+        ("frame", "'drawer': the link 'case' of its frame 'tool' does not move"),
         ("mass", "'drawer': the link that moves has no mass"),
     ],
 )
@@ -126,3 +130,17 @@ def test_shapes_of_an_object_are_in_the_frames_of_its_parts():
     assert thing.base_shapes == (POST,)
     assert thing.moving_shapes == (Shape(Box((0.3, 0.02, 0.2)), Pose((0.15, 0.0, 0.0))),)
     assert thing.moving_inertial.com == pytest.approx((0.15, 0.0, 0.0))
+    x, y, z = EDGE.position
+    assert thing.contact_shapes[0].T_link_shape.position == pytest.approx((0.15 - x, -y, -z))
+    size, centre = thing.contact_box
+    assert (*size, *centre) == pytest.approx((0.3, 0.02, 0.2, 0.15 - x, -y, -z))
+
+
+def test_pose_of_an_object_is_at_its_contact_point():
+    thing = door(TURNED)
+    for angle in (0.0, 0.7, -1.2):
+        turned = Pose.from_xyz_rpy((0.0, 0.0, 0.0), (0.0, 0.0, angle))
+        expected = TURNED @ AT @ turned @ EDGE
+        (pose,) = thing.placed_joint.poses(np.array([angle]))
+        assert pose[:3] == pytest.approx(expected.position)
+        assert thing.placed_joint.positions(pose[None]) == pytest.approx([angle])
