@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -16,7 +17,7 @@ from morphgen.checks import check
 from morphgen.checks.conformance import ConformanceRow, conformance
 from morphgen.doctor import Entry, attempt, failure
 from morphgen.encoding.robot_hash import robot_hash
-from morphgen.errors import MorphgenError, PartError
+from morphgen.errors import MorphgenError, PartError, one_line
 from morphgen.files import file_sha256
 from morphgen.formats.bundle import MJCF, write_bundle
 from morphgen.formats.picture import gl_context, render
@@ -67,13 +68,16 @@ def _library() -> Entry:
     except PartError as error:
         variable = f"{LIBRARY_VARIABLE}={os.environ.get(LIBRARY_VARIABLE, '')}"
         return Entry("library", "error", f"{error}; change {variable}")
-    counts = {kind: len(library.names(kind)) for kind in PART_KINDS}
+    kinds = Counter(manifest.kind for manifest in library.manifests())
+    counts = {kind: kinds[kind] for kind in PART_KINDS}
     listed = ", ".join(f"{count} {kind}" for kind, count in counts.items())
     text = f"{sum(counts.values())} parts: {listed}"
     for folder in library.folders[len(shipped_folders()) :]:
         text += f"; {len(Library([folder]).paths)} of them in {folder} ({LIBRARY_VARIABLE})"
     data = {"parts": counts, "folders": [str(folder) for folder in library.folders]}
-    return Entry("library", "ok", text, data)
+    if faults := library.faults():
+        text += f"; left out: {'; '.join(map(str, faults))}"
+    return Entry("library", "warning" if faults else "ok", one_line(text), data)
 
 
 def _robot_package(package: str) -> Entry:

@@ -77,7 +77,7 @@ def read_record(
         return msgspec.convert(data, kind, strict=True)
     except msgspec.ValidationError as invalid:
         path, reason = _fault(data, kind, ())
-        line = "" if yaml_text is None else f":{_line(yaml_text, path)}"
+        line = "" if yaml_text is None else f":{value_line(yaml_text, path)}"
         steps = (f"[{step}]" if isinstance(step, int) else f".{step}" for step in path)
         location = f"{''.join(steps).removeprefix('.')}: " if path else ""
         raise error(f"{where}{line}: {location}{reason}") from invalid
@@ -171,7 +171,7 @@ def _is_record(hint: object) -> bool:
     return isinstance(hint, type) and issubclass(hint, msgspec.Struct)
 
 
-def _line(text: str | bytes, path: KeyPath) -> int:
+def value_line(text: str | bytes, path: KeyPath) -> int:
     """Return the line of a value in YAML text."""
     node = yaml.compose(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     line = 1

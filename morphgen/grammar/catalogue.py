@@ -18,7 +18,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from morphgen.grammar.library import Library, default_library, shipped_folders
+from morphgen.errors import MorphgenError
+from morphgen.grammar.library import Library, default_library, note_left_out, shipped_folders
 from morphgen.grammar.manifest import Manifest, PackageSource, PartKind
 
 if TYPE_CHECKING:
@@ -32,11 +33,17 @@ def catalogue(library: Library, kind: str | None = None) -> list[dict[str, objec
     """Return a row of facts about every part, or about those of one kind, at default parameters.
 
     The reach [m] is the largest distance from the mount to a port or the tool; the mass is in kg.
+    A part that cannot be loaded is left out, and a line says why.
     """
     stored = stored_facts()
     rows: list[dict[str, object]] = []
     for manifest in library.manifests(cast(PartKind, kind)):
-        facts = known_facts(manifest, stored) or compute_facts(manifest)
+        try:
+            facts = known_facts(manifest, stored) or compute_facts(manifest)
+        except MorphgenError as error:
+            place = "" if str(manifest.path) in str(error) else f"{manifest.path}: "
+            note_left_out(f"{place}{error}")
+            continue
         rows.append(
             {
                 "name": manifest.name,

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
-from functools import cached_property
+from collections.abc import Iterable, Iterator
+from functools import cached_property, lru_cache
 from importlib.resources import files
 from os import PathLike
 from pathlib import Path
 from typing import TypeAlias
 
 from morphgen.arguments import path_argument
-from morphgen.errors import PartError, nearest
+from morphgen.errors import PartError, nearest, one_line
 from morphgen.files import cached_until_changed
 from morphgen.grammar.manifest import PART_KINDS, Manifest, PartKind, read_manifest
+from morphgen.progress import note
 
 LIBRARY_VARIABLE = "MORPHGEN_LIBRARY"
 """Environment variable with folders of a user's own parts, separated as in ``PATH``."""
@@ -60,16 +61,41 @@ class Library:
         return manifest
 
     def names(self, kind: PartKind | None = None) -> list[str]:
-        """Return the names of all parts, or of those of one kind, sorted."""
-        return [name for name, path in self.paths.items() if kind in (None, _manifest(path).kind)]
+        """Return the names of all sound parts, or of those of one kind, sorted."""
+        return [manifest.name for manifest in self._sound() if kind in (None, manifest.kind)]
 
     def manifests(self, kind: PartKind | None = None) -> list[Manifest]:
-        """Return the manifests of all parts, or of those of one kind, by kind and name."""
-        manifests = [_manifest(path) for path in self.paths.values()]
-        of_kind = [manifest for manifest in manifests if kind in (None, manifest.kind)]
+        """Return the manifests of all sound parts, or of those of one kind, by kind and name."""
+        of_kind = [manifest for manifest in self._sound() if kind in (None, manifest.kind)]
         return sorted(
             of_kind, key=lambda manifest: (PART_KINDS.index(manifest.kind), manifest.name)
         )
+
+    def faults(self) -> list[PartError]:
+        """Return why parts cannot be read, by name."""
+        return [result for result in self._results() if isinstance(result, PartError)]
+
+    def _sound(self) -> Iterator[Manifest]:
+        """Yield the manifests of parts that can be read; a line names each other file."""
+        for result in self._results():
+            if isinstance(result, PartError):
+                note_left_out(str(result))
+            else:
+                yield result
+
+    def _results(self) -> Iterator[Manifest | PartError]:
+        """Yield the manifest of every part, or why it cannot be read, by name."""
+        for path in self.paths.values():
+            try:
+                yield _manifest(path)
+            except PartError as error:
+                yield error
+
+
+@lru_cache(maxsize=1024)
+def note_left_out(fault: str) -> None:
+    """Show a line that a part is left out of a list; once, although a command lists them often."""
+    note(f"left out: {one_line(fault)}")
 
 
 def default_library(extra: LibraryFolders = ()) -> Library:

@@ -14,7 +14,7 @@ from msgspec.structs import fields, replace
 
 from morphgen.errors import FormatError, PartError, nearest
 from morphgen.formats.data_files import parse_yaml, read_bytes
-from morphgen.formats.records import FiniteNumber, PositiveNumber, Record, read_record
+from morphgen.formats.records import FiniteNumber, PositiveNumber, Record, read_record, value_line
 
 SCHEMA_FILE = Path(__file__).with_name("manifest.schema.json")
 """The JSON schema of a manifest, for editors; ``docs/part_manifest.py`` writes it."""
@@ -266,7 +266,8 @@ def read_manifest(path: Path) -> Manifest:
         allowed = _keys() - (TEMPLATE_ONLY if "source" in data else REAL_ONLY)
         for key in data:
             if isinstance(key, str) and key not in allowed:
-                raise PartError(f"{path}: unknown key {key!r}{nearest(key, allowed)}")
+                line = value_line(text, (key,))
+                raise PartError(f"{path}:{line}: unknown key {key!r}{nearest(key, allowed)}")
         if "reference" in data:
             data["citation"] = data.pop("reference")
     manifest = read_record(data, Manifest, str(path), PartError, yaml_text=text)

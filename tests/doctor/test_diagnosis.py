@@ -158,6 +158,10 @@ def test_folders_of_the_user_are_named(tmp_path, monkeypatch):
     assert f"0 of them in {tmp_path} ({LIBRARY_VARIABLE})" in entries["library"].text
     assert entries["ROS_PACKAGE_PATH"].text.startswith("/opt/ros; ")
     assert {entry.status for entry in entries.values()} == {"ok"}
+    (tmp_path / "broken.yaml").write_text("name: ]")
+    library = by_name(self_test.files())["library"]
+    assert library.status == "warning"
+    assert f"; left out: {tmp_path}/broken.yaml:1:7: invalid YAML" in library.text
     monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path / "none"))
     library = by_name(self_test.files())["library"]
     assert library.status == "error"

@@ -140,13 +140,33 @@ def test_a_missing_folder_is_named(tmp_path):
         default_library([tmp_path / "nowhere"]).names()
 
 
-def test_a_broken_manifest_does_not_affect_other_parts(tmp_path):
+def test_broken_manifests_hide_no_other_part_and_are_named_once(tmp_path, caplog):
     write_part(tmp_path)
     (tmp_path / "broken.yaml").write_text("name: ]")
+    write_part(tmp_path, name="strange", colour="red")
+    write_part(tmp_path, name="vanished", file="vanished.xacro")
+    write_part(tmp_path, name="rootless", root="stem")
     library = default_library([tmp_path])
     assert library.manifest("pincer", "ee").name == "pincer"
-    with pytest.raises(PartError, match=r"broken\.yaml:1:7: invalid YAML"):
-        library.names("ee")
+    assert {"pincer", "vanished", "rootless"} == set(library.names("ee")) - set(LIBRARY.names())
+    rows = catalogue(library, "ee")
+    assert {row["name"] for row in rows} - set(LIBRARY.names()) == {"pincer"}
+    library.manifests()
+    faults = {
+        "broken.yaml:1:7": "invalid YAML",
+        "strange.yaml:32": "unknown key 'colour'; valid: ",
+        "vanished.yaml": r"part 'vanished': \S*vanished.xacro: no such file",
+        "rootless.yaml": "no link 'stem'",
+    }
+    assert len(caplog.messages) == len(faults)
+    for place, fault in faults.items():
+        folder = re.escape(str(tmp_path))
+        pattern = rf"left out: {folder}/{place}: .*{fault}"
+        assert sum(bool(re.match(pattern, line)) for line in caplog.messages) == 1, pattern
+    assert len(library.faults()) == 2
+    for name in ("broken", "vanished", "rootless"):
+        with pytest.raises(PartError, match=name):
+            load_part(library.manifest(name))
 
 
 STORED = json.loads(FACTS_FILE.read_text())

@@ -89,7 +89,7 @@ def serve(
     folders = [path.parent if path.is_file() else path for path in targets]
     roots = tuple(dict.fromkeys((Path.cwd().resolve(), *folders)))
     files = FileAccess(default_library(library).folders, roots, Path("/nowhere"))
-    files.library.names()  # reports a missing folder or a broken part before the server starts
+    files.library.names()  # reports a missing folder and broken parts before the server starts
     start = start_address(words, files)
     policy = access_policy(host, origins)
     _require_local_address(host)
