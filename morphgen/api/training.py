@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
@@ -19,7 +20,7 @@ from morphgen.processes import usable_cores
 from morphgen.progress import note
 from morphgen.rl.agents import AGENTS, preset_of
 from morphgen.rl.config import AgentSpec, configs_of, owners_of, parse_agent, parse_constants
-from morphgen.rl.runs.checkpoint import CHECKPOINT, RunConfig
+from morphgen.rl.runs.checkpoint import CHECKPOINT, CONFIG, RunConfig, read_config
 from morphgen.rl.runs.robot_source import (
     GrammarSource,
     OneRobot,
@@ -142,7 +143,8 @@ def train(
         agent: ``se``, ``me-mlp``, ``me-tf`` or ``me-graph``, with switches that are on (+) or
             off (-) and channels of observations: ``me-tf-symlog+task-reweighting+ik``.
         preset: Constants and switches to begin with: ``fast`` or ``paper``; by default the agent's.
-        steps: Number of control steps of all environments together; by default the preset's.
+        steps: Number of control steps of all environments together; by default the preset's, or
+            with ``resume`` that of the run, as for ``envs`` and ``sim``.
         envs: Number of environments, which the robots share; by default the preset's.
         sim: Name of the simulator, by default ``mujoco``.
         workers: Number of processes of PyBullet, or of threads of MuJoCo; by default as many as
@@ -187,8 +189,6 @@ def train(
     least |= {"steps": 1, "envs": 1, "workers": 1, "seed": 0, "goal_seed": 0}
     require_types(given, TaskError, *texts, **least)
     require_side(on)
-    simulator = sim or DEFAULT_SIMULATOR
-    require_simulator_device(simulator, batch_device(simulator, device))
     spec = parse_agent(agent)
     if drawn is None:
         if robot_seed is not None or held_out or slice_updates is not None:
@@ -196,14 +196,24 @@ def train(
         source: Source = other_side(named_source(given), on)
     else:
         source = _source_to_draw(given)
-    config = run_config(source, spec, given)
-    _require_used(config, given)
-    if isinstance(source, GrammarSource):
-        config = _with_drawn_robots(config, source, given)  # which takes minutes
     # Positions came first and have no suffix.
     name = _folder_name(source) + "-pose" * (goal == "pose")
     folder = Path(out) if out is not None else Path("runs") / name / str(spec) / f"seed{seed}"
+    if resumed := resumed_config(folder, resume=resume):
+        given.steps = steps or resumed.ppo.total_timesteps
+        given.envs = envs or resumed.num_envs
+        given.sim = sim or resumed.sim
+    config = run_config(source, spec, given)
+    require_simulator_device(config.sim, batch_device(config.sim, device))
+    _require_used(config, given)
+    if isinstance(source, GrammarSource):
+        config = _with_drawn_robots(config, source, given)  # which takes minutes
     return train_run(folder, config, given)
+
+
+def resumed_config(folder: Path, *, resume: bool) -> RunConfig | None:
+    """Return the configuration of the run that ``resume`` continues, if there is one."""
+    return read_config(folder) if resume and (folder / CONFIG).is_file() else None
 
 
 def named_source(given: SimpleNamespace, side: Side = "train") -> SplitSource | OneRobot:
@@ -412,14 +422,25 @@ def train_run(folder: Path, config: RunConfig, given: SimpleNamespace) -> Traini
     workers = given.workers
     if isinstance(config.source, GrammarSource) and not SIMULATORS[config.sim].takes_workers:
         workers = None  # the others have drawn the robots
+    begun: list[str] = []
+
+    def begin() -> None:
+        begun.append(_described(folder, config))
+        note(begun[0])
+
     parts = train_parts(
         folder,
         config,
         resume=given.resume,
         execution=ExecutionConfig(workers, given.tensorboard, given.wandb, given.minutes),
         show=given.show,
-        begin=lambda: note(_described(folder, config)),
+        begin=begin,
     )
+    if parts and not begun:
+        note(
+            f"{folder} is finished, with all {config.ppo.total_timesteps:,} steps; to train longer:"
+            f" morphgen finetune {shlex.quote(str(folder))} --on train --steps N"
+        )
     return TrainingRun(folder, config, tuple(parts))
 
 

@@ -15,6 +15,7 @@ from morphgen.api.training import (
     TrainingRun,
     named_source,
     read_constants,
+    resumed_config,
     run_config,
     split_side,
     train_run,
@@ -67,6 +68,10 @@ from morphgen.tasks.registry import (
 from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
 
 RESUME = "with --resume"
+FINETUNING_STEPS = 100_000
+"""Number of control steps of ``finetune`` by default."""
+FINETUNING_ENVS = 64
+"""Number of environments of ``finetune`` by default."""
 
 
 def agent_text(args: argparse.Namespace) -> str:
@@ -136,12 +141,18 @@ def finetune(args: argparse.Namespace) -> None:
     folder = args.out or parent / "finetuned" / f"{args.on}-seed{args.seed}"
     with training_progress(RESUME) as display:
         given = SimpleNamespace(**vars(args), show=display.training)
-        run = train_run(folder, _finetuning_config(files[0], args), given)
+        run = train_run(folder, _finetuning_config(files[0], folder, args), given)
     _print_run(run, args.minutes)
 
 
-def _finetuning_config(file: Path, args: argparse.Namespace) -> RunConfig:
+def _finetuning_config(file: Path, folder: Path, args: argparse.Namespace) -> RunConfig:
     initial, _ = read_checkpoint(file)
+    resumed = resumed_config(folder, resume=args.resume)
+    steps, envs, sim = (
+        (resumed.ppo.total_timesteps, resumed.num_envs, resumed.sim)
+        if resumed
+        else (FINETUNING_STEPS, FINETUNING_ENVS, initial.sim)
+    )
     source: Source
     if args.words:
         given = SimpleNamespace(**vars(args), robots=" ".join(args.words))
@@ -153,12 +164,12 @@ def _finetuning_config(file: Path, args: argparse.Namespace) -> RunConfig:
         raise TaskError(f"--set {min(unknown)}: the networks are those of the checkpoint")
     switches = {"bf16": args.bf16, "compile": args.compile}
     changes |= {name: value for name, value in switches.items() if value is not None}
-    changes |= {"total_timesteps": args.steps, "curriculum": args.curriculum}
+    changes |= {"total_timesteps": args.steps or steps, "curriculum": args.curriculum}
     return replace(
         finetuning_config(initial, source, str(file.resolve()), changes),
         seed=args.seed,
-        sim=args.sim or initial.sim,
-        num_envs=args.envs,
+        sim=args.sim or sim,
+        num_envs=args.envs or envs,
         device=args.device,
         tasks=with_goal(initial.tasks, args.goal, tasks_of(source)),
     )

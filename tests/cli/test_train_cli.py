@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from helpers.commands import start, tree
-from helpers.runs import ROLLOUT, RUN, SMALL
+from helpers.runs import NETWORK, ROLLOUT, RUN, SMALL
 from morphgen.benchmark.scores.submission import read_table
 from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, read_config
 from morphgen.rl.runs.robot_source import specs_of
-from morphgen.rl.runs.training import METRICS, read_metrics
+from morphgen.rl.runs.training import METRICS, _StopRequest, read_metrics
 from morphgen.tasks.goals.split_goals import read_goals
 from morphgen.tasks.scenes.env_specs import GoalConfig
 
@@ -35,7 +35,11 @@ def test_single_robot_is_trained_resumed_evaluated_and_played(run, tmp_path):
     before = tree(folder)
     code, _, err = run(*RUN, "--steps", "128", "--seed", "3", "--resume")
     assert (code, "update" in err) == (0, False)
+    command = f"morphgen finetune {folder.relative_to(tmp_path)} --on train --steps"
+    assert f"is finished, with all 128 steps; to train longer: {command} N\n" in err
     assert tree(folder) == before
+    few = ("--envs", "4", *ROLLOUT, "--no-tensorboard")
+    assert run(*command.split()[1:], "32", *few)[0] == 0
 
     code, out, _ = run("eval", folder, "--episodes", "2", "--out", "scores.csv")
     assert code == 0
@@ -52,6 +56,22 @@ def test_single_robot_is_trained_resumed_evaluated_and_played(run, tmp_path):
     code, out, _ = run("play", "reach", "planar-cube", "--policy", folder, "--sim", "mujoco")
     assert code == 0
     assert out.startswith("episode 1: ")
+
+
+def test_resume_continues_to_the_steps_of_the_run(run, monkeypatch):
+    quick = (*ROLLOUT, "--no-tensorboard", "--out")
+    words = ("planar-cube", "task=reach", "--agent", "me-mlp", *NETWORK)
+    train = ("train", *words, *quick, "run")
+    finetune = ("finetune", "run", "--on", "train", *quick, "tuned")
+    for command, sim in ((train, "kinematic"), (finetune, "mujoco")):
+        with monkeypatch.context() as patch:
+            patch.setattr(_StopRequest, "is_requested", True)
+            run(*command, "--steps", "96", "--envs", "4", "--sim", sim)
+        folder = Path(command[-1])
+        assert [each["update"] for each in read_metrics(folder)] == [1]
+        assert run(*command, "--resume")[0] == 0
+        assert [each["update"] for each in read_metrics(folder)] == [1, 2, 3]
+        assert "num_envs 4, not 8" in run(*command, "--resume", "--envs", "8")[2]
 
 
 @pytest.mark.slow
