@@ -184,7 +184,13 @@ def _require_task(task: Task[Any, Any]) -> None:
 TASKS: Registry[Task[Any, Any]] = Registry(
     "task",
     "morphgen.tasks",
-    {"reach": "morphgen.tasks.reach.task:REACH", "push": "morphgen.tasks.push.task:PUSH"},
+    {
+        "reach": "morphgen.tasks.reach.task:REACH",
+        "push": "morphgen.tasks.push.task:PUSH",
+        "drawer": "morphgen.tasks.articulated.task:DRAWER",
+        "door": "morphgen.tasks.articulated.task:DOOR",
+        "dial": "morphgen.tasks.articulated.task:DIAL",
+    },
     _require_task,
 )
 """Tasks; see ``morphgen.tasks.task.Task``."""

@@ -63,6 +63,22 @@ def row_norms(vectors: A) -> A:
     return length
 
 
+def rotated(quaternions: A, vectors: A) -> A:
+    """Return vectors (n, 3) turned by unit quaternions (n, 4) w, x, y, z."""
+    w, ux, uy, uz = (quaternions[..., i] for i in range(4))
+    x, y, z = (vectors[..., i] for i in range(3))
+    tx, ty, tz = 2 * (uy * z - uz * y), 2 * (uz * x - ux * z), 2 * (ux * y - uy * x)
+    turned: A = namespace_of(vectors).stack(
+        [
+            x + w * tx + uy * tz - uz * ty,
+            y + w * ty + uz * tx - ux * tz,
+            z + w * tz + ux * ty - uy * tx,
+        ],
+        -1,
+    )
+    return turned
+
+
 def choose(condition: A, value: float, otherwise: A | float = 0.0) -> A:
     """Return a value in the rows where a condition holds, and other values elsewhere, (n,)."""
     if isinstance(condition, torch.Tensor):

@@ -51,7 +51,11 @@ RANDOM = Baseline("random", "morphgen.rl.baselines.simple:Random")
 ZERO = Baseline("zero", "morphgen.rl.baselines.simple:Zero")
 JACOBIAN = Baseline("jacobian", "morphgen.rl.baselines.simple:JacobianColumns", ("reach",))
 IK = Baseline("ik", "morphgen.rl.baselines.ik:InverseKinematics", ("reach",))
-SCRIPTED = Baseline("scripted", "morphgen.rl.baselines.scripted_push:ScriptedPush", ("push",))
+SCRIPTED = Baseline(
+    "scripted",
+    "morphgen.rl.baselines.scripted_articulated:Scripted",
+    ("push", "drawer", "door", "dial"),
+)
 
 BASELINES: Registry[Baseline] = Registry(
     "baseline",

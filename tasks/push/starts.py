@@ -48,26 +48,44 @@ class Region:
 def push_region(
     robot: Robot, config: PushConfig, ground: float, rng: np.random.Generator
 ) -> Region:
-    """Return the region of a robot's block, which depends on how its tool moves.
+    """Return the region of a robot's block, of which x and edge are those of ``work_region``.
 
-    - Free robots, whose tool slides along two horizontal directions: the edge is in metres, x in
-      ``config.free_x``.
+    y at the start is at most ``config.start_depth`` below ``config.start``, and the line is at
+    ``config.line``; both are scaled down in proportion for robots that reach less than 0.4 m.
+    """
+    size = float(rng.uniform(*config.block_size))
+    edge, scale, x = work_region(robot, size, config.arm_x, config.free_x, ground)
+    y = ((config.start - config.start_depth) * scale, config.start * scale)
+    return Region(edge, scale, x, y, config.line * scale)
+
+
+def work_region(
+    robot: Robot,
+    size: float,
+    arm_x: tuple[float, float],
+    free_x: tuple[float, float],
+    ground: float,
+) -> tuple[float, float, tuple[float, float]]:
+    """Return edge, scale of lengths and range of x of things that a robot pushes on the ground.
+
+    They depend on how its tool moves:
+
+    - Free robots, whose tool slides along two horizontal directions: the edge is ``size`` in
+      metres, x in ``free_x``.
     - Arms, whose tool slides along none and changes its height: the edge is relative to the
-      effective reach, x in ``config.arm_x`` effective reaches beyond the shoulder.
+      effective reach, x in ``arm_x`` effective reaches beyond the shoulder.
     - All others, such as a rod on one slide or a chain in a horizontal plane: x is anywhere the
-      tool can be at the height of the block while slides are at home; feasibility tests decide
+      tool can be at the height of the thing while slides are at home; feasibility tests decide
       where it can push. The edge is in metres if the tool slides, else relative to the effective
       reach.
 
-    y at the start is at most ``config.start_depth`` below ``config.start``, and the line is at
-    ``config.line``; both are scaled down in proportion for robots that reach less than 0.4 m. That
-    reach is the effective reach, or for robots that slide half of the range of y of the tool; for
-    slides along one direction only it is divided by the square root of 2, since the tool has to
-    swing around the block.
+    The scale is below 1 for robots that reach less than 0.4 m, in proportion. That reach is the
+    effective reach, or for robots that slide half of the range of y of the tool; for slides along
+    one direction only it is divided by the square root of 2, since the tool has to swing around
+    the thing.
     """
     shoulder, arm_reach = tool_reach(robot)  # refuses a robot whose tool does not move
     tool_positions = _tool_positions(robot)
-    size = float(rng.uniform(*config.block_size))
     slides = _num_slide_directions(robot)
     if slides:
         reach = float(np.ptp(tool_positions[1])) / 2 / (1.0 if slides == 2 else math.sqrt(2))
@@ -79,13 +97,12 @@ def push_region(
     scale = min(1.0, reach / FULL_REACH)
     edge = size * (scale if slides else reach)
     if slides == 2:
-        x = (config.free_x[0] * scale, config.free_x[1] * scale)
+        x = (free_x[0] * scale, free_x[1] * scale)
     elif not slides and np.ptp(tool_positions[2]) > _LEVEL:
-        x = (shoulder[0] + config.arm_x[0] * reach, shoulder[0] + config.arm_x[1] * reach)
+        x = (shoulder[0] + arm_x[0] * reach, shoulder[0] + arm_x[1] * reach)
     else:
         x = _tool_x_range(robot, ground, edge)
-    y = ((config.start - config.start_depth) * scale, config.start * scale)
-    return Region(edge, scale, x, y, config.line * scale)
+    return edge, scale, x
 
 
 def draw_blocks(region: Region, ground: float, n: int, rng: np.random.Generator) -> Array:

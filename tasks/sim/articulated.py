@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,6 +18,8 @@ from morphgen.model.rotation import Vec3, rotate
 from morphgen.model.tree import RigidGroup, rigid_groups
 from morphgen.tasks.sim.rigid_bodies import merged_inertial
 from morphgen.typing import Array
+
+_SHORTEST_LEVER = 1e-3  # least distance of a contact point from the axis of a hinge [m]
 
 
 @dataclass(frozen=True)
@@ -111,6 +114,39 @@ class ArticulatedObject:
         low, high = boxes[int(np.argmin(outside))]
         return tuple((high - low).tolist()), tuple(((high + low) / 2).tolist())
 
+    @cached_property
+    def direction(self) -> Vec3:
+        """Unit vector in which the contact point moves as the joint does, in the state's frame."""
+        x, y, z = self._contact_motion
+        return (x / self.lever, y / self.lever, z / self.lever)
+
+    @cached_property
+    def lever(self) -> float:
+        """Motion of the contact point per motion of the joint: 1 for slides, m/rad for hinges.
+
+        Raises:
+            SimulationError: If the contact point is on the axis.
+        """
+        lever = math.hypot(*self._contact_motion)
+        if lever < _SHORTEST_LEVER:
+            raise SimulationError(f"object {self.body.name!r}: its frame {TOOL!r} is on the axis")
+        return lever
+
+    def extent(self, sign: Array) -> Array:
+        """Return the distance from the contact point to the surface where tools push, (n,) [m].
+
+        They push from behind: a joint that moves to positive positions, sign 1, on the side that
+        is against ``direction``, and with sign -1 on the other.
+        """
+        size, centre = np.array(self.contact_box)
+        return np.asarray(size / 2 @ np.abs(self.direction) - sign * (centre @ self.direction))
+
+    @cached_property
+    def _contact_motion(self) -> Vec3:
+        axis = self.joint.unit_axis
+        moved = axis if self.joint.kind == "prismatic" else np.cross(axis, self.contact).tolist()
+        return (moved[0], moved[1], moved[2])
+
     @property
     def _contact_link(self) -> str:
         """Link of the contact point."""
@@ -188,7 +224,7 @@ class ObjectJoints:
         turn = np.concatenate([np.cos(half), np.sin(half) * self.axis], axis=1)
         quaternion = _product(self.frame[:, 3:], turn)
         quaternion *= np.where(quaternion[:, :1] < 0, -1.0, 1.0)
-        contact = self.frame[:, :3] + slide * self.direction + _rotated(quaternion, self.offset)
+        contact = self.frame[:, :3] + slide * self.direction + rotated(quaternion, self.offset)
         return np.concatenate([contact, quaternion], axis=1)
 
     def positions(self, poses: Array) -> Array:
@@ -200,7 +236,7 @@ class ObjectJoints:
         return np.asarray(np.where(self.is_slide, along, angle))
 
 
-def _rotated(quaternions: Array, vectors: Array) -> Array:
+def rotated(quaternions: Array, vectors: Array) -> Array:
     """Return vectors (k, 3) turned by quaternions (k, 4)."""
     w, xyz = quaternions[:, :1], quaternions[:, 1:]
     twice = 2 * np.cross(xyz, vectors)

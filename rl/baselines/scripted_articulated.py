@@ -1,0 +1,313 @@
+"""The baseline ``scripted`` of drawer, door and dial: get behind the object, and follow its path.
+
+A robot moves the joint of its object from behind. A *track* is a sequence of configurations whose
+tool is at one distance behind the object as this moves to its goal and a little farther; it is
+found by inverse kinematics and tests of collisions, without dynamics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from morphgen.model.kinematics import unwrap_joints
+from morphgen.rl.baselines.path_planner import (
+    Path,
+    PathCost,
+    PathFollower,
+    PathPlanner,
+    fractions_towards,
+)
+from morphgen.tasks.actions import encode_actions
+from morphgen.tasks.articulated.envs import ArticulatedEnvs
+from morphgen.tasks.articulated.starts import ArticulatedStartSet, PathFinder, motion_poses
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.push.starts import BEHIND
+from morphgen.tasks.scenes.robot_tables import RobotTables
+from morphgen.tasks.sim.base import CONTROL_PERIOD
+from morphgen.tasks.task import EnvSpec
+from morphgen.typing import Array
+
+SPEED = 0.006  # largest motion of the tool along its track in a control step [m]: 0.3 m/s
+TRACK = 16  # configurations of a track
+
+# Lengths are in sizes of the object (the edge of push's block); costs in control steps.
+_NEAREST, _QUICKEST = 16, 16
+"""Starts of inverse kinematics per distance: those nearest in space, and nearest in joint space."""
+_SHIFTS = np.arange(0.05, 2.0, 0.05)
+"""Distances that the object is moved against its motion to find where it meets the robot."""
+_BEYOND = 0.5  # length of a track beyond the goal and the gap
+_LEAST_PART = 0.3  # part of the motion that a track has to make
+_UNFINISHED_COST = 400.0  # cost of a track that makes no part of the motion
+_CANDIDATES = 24  # tracks, the cheapest first, to which straight paths are tried
+_TREE_ITERATIONS = 1500  # random configurations of a tree where no straight path is free
+
+MAX_PLANS = 8  # maximum number of plans per episode
+LEAD, LEAD_STEP, MAX_LEAD = 0.03, 0.004, 0.25
+"""Lead of the commanded tool before the object: initial value, growth per control step in which the
+object does not move, and maximum [m]. A slender arm needs it to build up force."""
+MOVING = 0.02  # speed of the contact point from which the object counts as moving [m/s]
+PATIENCE = 50  # control steps in which the object must move by ``PROGRESS``; else plan again
+PROGRESS = MOVING * PATIENCE * CONTROL_PERIOD  # [m]
+ARRIVED, SETTLE_STEPS = 0.02, 15
+"""A push begins when the joints are ``ARRIVED`` from their targets [rad or m], or ``SETTLE_STEPS``
+control steps after the last waypoint."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A path to the first configuration of a track, and the track."""
+
+    path: tuple[Array, ...]  # waypoints, each (dof,)
+    track: Array  # configurations, shape (TRACK, dof)
+    step: float  # motion of the contact point between two of them [m]
+    length: float  # motion of the contact point up to the last sound one [m]
+    gap: float  # distance of the robot from the object along the track [m]
+
+
+class MotionPlanner:
+    """Plans how a robot moves its object."""
+
+    def __init__(
+        self, spec: EnvSpec, tables: RobotTables, robot: int, rng: np.random.Generator
+    ) -> None:
+        """Collect free configurations with the tool near the object's contact point."""
+        starts, self._robot = spec.goals, spec.robot
+        if not isinstance(starts, ArticulatedStartSet):
+            raise ValueError(f"{self._robot.name} has no articulated object")
+        thing = starts.thing
+        self._thing, self._edge = thing, float(max(thing.contact_box[0]))
+        ends = np.concatenate([starts.start, starts.goal])
+        points = thing.placed_joint.poses(ends)[:, :3]
+        low, high = points.min(axis=0) - 2 * self._edge, points.max(axis=0) + 2 * self._edge
+        low[2] = starts.ground
+        self._finder = PathFinder(self._robot, self._edge, low, high, rng)
+        self._finder.stand(thing)
+        self._space = self._finder.space
+        step = tables.max_step[robot, : self._robot.dof].double().cpu().numpy()
+        self._planner = PathPlanner(self._space, step, int(rng.integers(2**63)))
+
+    def plan(
+        self, q: Array, position: float, goal: float, attempt: int, steps_left: float
+    ) -> Plan | None:
+        """Return the cheapest plan from a configuration (dof,) and a position of the joint."""
+        joints = self._thing.placed_joint
+        pose = joints.poses(np.array([position]))[0]
+        tracks, gaps, parts, step = self._tracks(q, position, goal)
+        if not len(tracks):
+            return None
+        steps = self._planner.steps(tracks[:, :-1], tracks[:, 1:])
+        length = np.nansum(steps, axis=1)
+        cost = PathCost(length + _UNFINISHED_COST * (1 - parts), steps_left - length)
+        order = np.argsort(cost.of(self._planner.steps(q, tracks[:, 0])), kind="stable")
+        order = order[:_CANDIDATES]
+        ends, chosen = tracks[order, 0], PathCost(cost.goal_cost[order], cost.deadline[order])
+        path: Path | None
+        path = self._planner.plan_straight(q, ends, cost=chosen, block=pose)
+        if path is None:
+            path, tree = self._planner.plan_rrt(
+                q, ends, block=pose, attempt=attempt, iterations=_TREE_ITERATIONS
+            )
+            path = path or self._planner.plan_straight(q, ends, cost=chosen, block=pose, tree=tree)
+        if path is None:
+            return None
+        best = order[path.goal]
+        track = tracks[best]
+        last = int(np.isfinite(track[:, 0]).sum()) - 1
+        track[last + 1 :] = track[last]
+        return Plan(path.waypoints, track, step, last * step, float(gaps[best]))
+
+    def _tracks(self, q: Array, position: float, goal: float) -> tuple[Array, Array, Array, float]:
+        """Return tracks (n, TRACK, dof), their gaps and parts of the motion (n,), and their step.
+
+        A track is NaN from where it is not sound.
+        """
+        lever, edge, finder = self._thing.lever, self._edge, self._finder
+        sign = 1.0 if goal > position else -1.0
+        to_go = abs(goal - position) * lever
+        farthest = to_go + (_SHIFTS[-1] + _BEYOND) * edge
+        end = position + sign * farthest / lever
+        poses = motion_poses(self._thing, np.array([position]), np.array([end]), TRACK)
+        step = farthest / (TRACK - 1)
+        bank = unwrap_joints(self._robot, q, finder.bank)
+        quickest = np.argsort(self._planner.steps(q, bank), kind="stable")[:_QUICKEST]
+        found = []
+        for distance in BEHIND:
+            behind = finder.behind(poses, np.array([sign]), distance * edge)
+            rows = np.concatenate([finder.nearest(behind[:, 0])[0, :_NEAREST], quickest])
+            count = len(rows)
+            found.append(
+                finder.follow(
+                    bank[rows],
+                    finder.tools[rows],
+                    behind.repeat(count, axis=0),
+                    poses.repeat(count, axis=0),
+                )
+            )
+        tracks = np.concatenate(found)
+        tracks = tracks[np.isfinite(tracks[:, 0, 0])]
+        gaps = self._gaps(tracks[:, 0], position, sign)
+        made = (np.isfinite(tracks[:, :, 0]).sum(axis=1) - 1) * step - gaps
+        parts = np.clip(made / max(to_go, 1e-9), 0.0, 1.0)
+        good = np.isfinite(gaps) & (parts >= _LEAST_PART)
+        return tracks[good], gaps[good], parts[good], step
+
+    def _gaps(self, q: Array, position: float, sign: float) -> Array:
+        """Return how far robots (n, dof) are from the object along its motion, (n,) [m], or inf."""
+        shifts = _SHIFTS * self._edge
+        poses = self._thing.placed_joint.poses(position - sign * shifts / self._thing.lever)
+        n, k = len(q), len(shifts)
+        touched = ~self._space.free(np.repeat(q, k, axis=0), np.tile(poses, (n, 1))).reshape(n, k)
+        return np.where(touched.any(axis=1), shifts[touched.argmax(axis=1)], np.inf)
+
+    def retreat(self, q: Array, track: Array, along: float) -> Array:
+        """Return the configuration of a track that is behind the object, free of collisions."""
+        near = track[max(int(along), 0)]
+        return near if np.isfinite(near).all() else q
+
+
+class ScriptedArticulated:
+    """Gets behind the object, follows its path in closed loop, and plans again where that fails.
+
+    Environments of other tasks stand still.
+    """
+
+    def __init__(self, seed: int) -> None:
+        """Set up; plans depend on the seed, the robot, its starts and the state of the episode."""
+        self._seed = seed
+        self._specs: Sequence[EnvSpec] = ()
+        self._planners: dict[int, MotionPlanner] = {}
+        self._task: TaskBatch | None = None
+
+    def act(self, task: TaskBatch) -> torch.Tensor:
+        """Return a step along the path behind the object, or along the track; shape (n, L)."""
+        if self._specs is not task.specs:
+            self._specs, self._planners = task.specs, {}
+        if self._task is not task:
+            self._begin(task)
+        position, goal = self._positions(task)
+        new = self.ours & (task.episode_step == 0)
+        self._num_plans[new] = 0
+        failed = self._advance(task, position) | (self.ours & ~self._active)
+        for env in torch.nonzero(new | (failed & (self._num_plans < MAX_PLANS)))[:, 0].tolist():
+            self._plan(task, env, float(position[env]), float(goal[env]), is_new=bool(new[env]))
+        targets = torch.where(self._pushing[:, None], self._along_track(), self._follower.waypoint)
+        targets = torch.where(self._active[:, None], targets, task.targets)
+        return encode_actions(fractions_towards(task, targets), task.action_kind)
+
+    def _begin(self, task: TaskBatch) -> None:
+        """Allocate the state of a batch: a row per environment, without plans."""
+        self._task, self._follower = task, PathFollower(task)
+        n, device = task.num_envs, task.device
+        names = {spec.task for spec in task.specs}
+        self._groups = [
+            (torch.nonzero(task.task_mask(name))[:, 0], envs)
+            for name in sorted(names)
+            if isinstance(envs := task.groups[name], ArticulatedEnvs)
+        ]
+        self.ours, self._active, self._pushing = torch.zeros(3, n, dtype=torch.bool, device=device)
+        for rows, _ in self._groups:
+            self.ours[rows] = True
+        self._num_plans, self._settling, self._still = torch.zeros(
+            3, n, dtype=torch.int64, device=device
+        )
+        self._track = task.targets[:, None].repeat(1, TRACK, 1)
+        # Step and length of the track, gap of the plan.
+        self._step, self._length, self._gap = torch.zeros(3, n, device=device)
+        # Lead and place of the commanded tool; the object's best motion, its position when the plan
+        # began, and its lever with the sign of the motion.
+        self._lead, self._along, self._best, self._begun, self._lever = torch.zeros(
+            5, n, device=device
+        )
+
+    def _positions(self, task: TaskBatch) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return positions and goals of the objects' joints, shape (n,) each."""
+        position = torch.zeros(task.num_envs, device=task.device)
+        goal = torch.zeros_like(position)
+        for rows, envs in self._groups:
+            formulas = envs.formulas
+            position[rows] = formulas.position(task.simulation.object_pose[rows])
+            goal[rows] = formulas.goal
+        return position, goal
+
+    def _plan(
+        self, task: TaskBatch, env: int, position: float, goal: float, *, is_new: bool
+    ) -> None:
+        """Make a plan in one environment."""
+        robot = int(task.env_robot_index[env])
+        spec = task.specs[robot]
+        if robot not in self._planners:
+            rng = np.random.default_rng([self._seed, robot])
+            self._planners[robot] = MotionPlanner(spec, task.robot_tables, robot, rng)
+        planner, dof = self._planners[robot], spec.robot.dof
+        q = task.targets[env, :dof].double().cpu().numpy()
+        start = q
+        if self._pushing[env] and not is_new:
+            moved = float((position - self._begun[env]) * self._lever[env])
+            track = self._track[env, :, :dof].double().cpu().numpy()
+            start = planner.retreat(q, track, moved / float(self._step[env]))
+        steps_left = int(task.max_episode_steps[env] - task.episode_step[env])
+        plan = planner.plan(start, position, goal, int(self._num_plans[env]), steps_left)
+        self._num_plans[env] += 1
+        self._active[env], self._pushing[env] = plan is not None, False
+        if plan is None:
+            return
+        way = plan.path if start is q else (start, *plan.path)
+        self._follower.follow(env, way)
+        self._track[env, :, :dof] = torch.from_numpy(plan.track).to(self._track)
+        self._step[env], self._length[env], self._gap[env] = plan.step, plan.length, plan.gap
+        lever = spec.goals.thing.lever  # type: ignore[attr-defined]  # a set of this task
+        self._lever[env] = lever if goal > position else -lever
+        self._begun[env], self._best[env], self._along[env] = position, 0.0, 0.0
+        self._lead[env], self._settling[env], self._still[env] = LEAD, 0, 0
+
+    def _advance(self, task: TaskBatch, position: torch.Tensor) -> torch.Tensor:
+        """Go on along the paths and tracks; return where pushes failed, (n,), bool."""
+        at_end = self._active & ~self._pushing & self._follower.advance()
+        self._settling = torch.where(at_end, self._settling + 1, self._settling)
+        arrived = (task.q - task.targets).abs().amax(dim=1) < ARRIVED
+        self._pushing = self._pushing | (at_end & (arrived | (self._settling > SETTLE_STEPS)))
+        moved = (position - self._begun) * self._lever
+        progress = moved > self._best + PROGRESS
+        self._best = torch.where(progress, moved, self._best)
+        self._still = torch.where(progress | ~self._pushing, 0, self._still + 1)
+        ahead = self._along - moved - self._gap
+        grow = self._pushing & (self._still > 2) & (ahead > self._lead - SPEED)
+        self._lead = torch.where(grow, self._lead + LEAD_STEP, self._lead).clamp(max=MAX_LEAD)
+        go = self._pushing & (ahead < self._lead)
+        self._along = torch.minimum(self._along + torch.where(go, SPEED, 0.0), self._length)
+        failed: torch.Tensor = (
+            self._active & self._pushing & (self._still > PATIENCE + self._gap / SPEED)
+        )
+        return failed
+
+    def _along_track(self) -> torch.Tensor:
+        """Return the configurations of the tracks where the commanded tools are, (n, J)."""
+        at = (self._along / self._step.clamp(min=1e-9)).clamp(0, TRACK - 1)
+        low = at.floor().long().clamp(max=TRACK - 2)
+        envs = torch.arange(len(at), device=at.device)
+        part = (at - low)[:, None]
+        return self._track[envs, low] * (1 - part) + self._track[envs, low + 1] * part
+
+
+class Scripted:
+    """The scripted controllers of all tasks that have one, each for its own environments."""
+
+    def __init__(self, seed: int) -> None:
+        """Set up; see the controllers."""
+        from morphgen.rl.baselines.scripted_push import ScriptedPush
+
+        self._push, self._articulated = ScriptedPush(seed), ScriptedArticulated(seed)
+
+    def act(self, task: TaskBatch) -> torch.Tensor:
+        """Return actions of all environments, shape (n, L)."""
+        if not any(isinstance(spec.goals, ArticulatedStartSet) for spec in task.specs):
+            return self._push.act(task)
+        actions = self._articulated.act(task)
+        pushes = task.task_mask("push")
+        if not bool(pushes.any()):
+            return actions
+        return torch.where(pushes[:, None], self._push.act(task), actions)
