@@ -58,7 +58,7 @@ from morphgen.tasks.registry import (
     batch_device,
     require_simulator_device,
 )
-from morphgen.tasks.scenes.env_specs import GoalConfig, load_robot
+from morphgen.tasks.scenes.env_specs import IN_EVERY_FILE, GoalConfig, load_robot
 from morphgen.tasks.task import TaskConfig
 
 
@@ -337,7 +337,7 @@ def _task_configs(
 ) -> tuple[TaskConfig, ...]:
     """Return the configurations of the tasks with a goal of reach and a number of goals."""
     tasks = tasks_of(source)
-    names = dict.fromkeys((*TASKS.builtin, *tasks))
+    names = dict.fromkeys((*IN_EVERY_FILE, *tasks))
     configs = with_goal((TASKS[name].config_type() for name in names), goal, tasks)
     if num_goals is None:
         return configs

@@ -279,9 +279,8 @@ class ScriptedArticulated:
         self._lead = torch.where(grow, self._lead + LEAD_STEP, self._lead).clamp(max=MAX_LEAD)
         go = self._pushing & (ahead < self._lead)
         self._along = torch.minimum(self._along + torch.where(go, SPEED, 0.0), self._length)
-        failed: torch.Tensor = (
-            self._active & self._pushing & (self._still > PATIENCE + self._gap / SPEED)
-        )
+        slow = self._still > PATIENCE + self._gap / SPEED
+        failed: torch.Tensor = slow & self._active & self._pushing
         return failed
 
     def _along_track(self) -> torch.Tensor:
@@ -290,7 +289,8 @@ class ScriptedArticulated:
         low = at.floor().long().clamp(max=TRACK - 2)
         envs = torch.arange(len(at), device=at.device)
         part = (at - low)[:, None]
-        return self._track[envs, low] * (1 - part) + self._track[envs, low + 1] * part
+        targets: torch.Tensor = torch.lerp(self._track[envs, low], self._track[envs, low + 1], part)
+        return targets
 
 
 class Scripted:

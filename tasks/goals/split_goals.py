@@ -255,12 +255,12 @@ def goal_files(results: Sequence[GoalResult], config: GoalConfig) -> Iterator[tu
         records.append(goal_record(result) | {"file": name, "sha256": _sha256(content)})
         yield name, content
     task_names = [result.task for result in results]
-    constants = {"format": FORMAT, "seed": config.seed, **config.as_data(task_names)}
+    tasks = config.as_data(task_names)
+    constants = {"format": FORMAT, "seed": config.seed, **tasks}
     head_text = json.dumps(constants, indent=2).removesuffix("\n}")
     lines = ",\n".join(f"    {json.dumps(record)}" for record in records)
     yield INDEX, f'{head_text},\n  "sets": [\n{lines}\n  ]\n}}\n'.encode()
-    documented = dict.fromkeys((*TASKS.builtin, *task_names))
-    arrays = "".join(TASKS[name].goal_files_readme for name in documented)
+    arrays = "".join(dict.fromkeys(TASKS[name].goal_files_readme for name in tasks))
     yield "README.md", _README.format(index=INDEX, tasks=arrays).encode()
 
 

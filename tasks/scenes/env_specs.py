@@ -26,6 +26,8 @@ from morphgen.tasks.sim.base import Scene
 from morphgen.tasks.task import EnvSpec, GoalSet, TaskConfig
 
 GROUND_STEP = 1e-4  # resolution of the height of a lowered ground, so that all machines agree [m]
+IN_EVERY_FILE = ("reach", "push")
+"""Tasks whose constants files of splits and runs have, whatever tasks they are about."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class GoalConfig:
     def as_data(self, used: Sequence[str] = ()) -> dict[str, dict[str, Any]]:
         """Return the constants by task as JSON data, which ``task_configs`` reads."""
         data = {}
-        for name in dict.fromkeys((*TASKS.builtin, *(c.task for c in self.tasks), *used)):
+        for name in dict.fromkeys((*IN_EVERY_FILE, *(c.task for c in self.tasks), *used)):
             config = self.task_config(name)
             keys, constants = config.file_keys, asdict(config)
             data[name] = {keys.get(field, field): value for field, value in constants.items()}
@@ -79,8 +81,8 @@ def task_configs(data: Mapping[str, Mapping[str, Any]]) -> tuple[TaskConfig, ...
 
 
 def default_configs() -> tuple[TaskConfig, ...]:
-    """Return the default constants of morphgen's own tasks."""
-    return tuple(TASKS[name].config_type() for name in TASKS.builtin)
+    """Return the default constants of the tasks that every file has."""
+    return tuple(TASKS[name].config_type() for name in IN_EVERY_FILE)
 
 
 def load_robot(
