@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from itertools import takewhile
+from operator import eq
 
 _MAX_LISTED = 24
 """Largest number of valid names that a hint lists completely."""
+_MAX_SHOWN = 8
+"""Largest number of valid names that a hint shows of a longer list."""
+_MIN_PART = 3
+"""Least length of a name that is near all that contain it [characters]."""
 _MAX_COMPARED = 200
 """Longest name that is compared with the valid ones [characters]; the time grows quadratically."""
 MALFORMED = (
@@ -108,13 +114,29 @@ def nearest(name: str, valid: Iterable[str], unlisted: Iterable[str] = ()) -> st
     choices = sorted(valid)
     if len(name) > _MAX_COMPARED:
         return f"; {len(choices)} are valid"
-    every = [*choices, *sorted(unlisted)]
-    close = [choice for choice in every if choice.lower() == name.lower()]
-    # Letters in another order are a more frequent slip than others that match as many.
-    close = close or [choice for choice in every if sorted(choice) == sorted(name)]
-    close = close or difflib.get_close_matches(name, every, n=1, cutoff=0.5)
-    guess = f"; did you mean {close[0]!r}?" if close else ";"
-    if len(choices) > _MAX_LISTED:
-        listed = sorted(difflib.get_close_matches(name, choices, n=8, cutoff=0.0))  # however unlike
-        return f"{guess} nearest of {len(choices)}: {', '.join(listed)}"
-    return f"{guess} valid: {', '.join(choices) or '(none)'}"
+    alike = {each: _likeness(name.lower(), each.lower()) for each in (*choices, *sorted(unlisted))}
+    best = max(alike, key=alike.__getitem__, default="")
+    guess = f"; did you mean {best!r}?" if alike.get(best) else ";"
+    if len(choices) <= _MAX_LISTED:
+        return f"{guess} valid: {', '.join(choices) or '(none)'}"
+    close = sorted(filter(alike.__getitem__, choices), key=alike.__getitem__, reverse=True)
+    if close == [best]:
+        return guess
+    if close:
+        return f"{guess} nearest of {len(choices)}: {', '.join(sorted(close[:_MAX_SHOWN]))}"
+    return f"{guess} {len(choices)} are valid, such as {', '.join(choices[:_MAX_SHOWN])}"
+
+
+def _likeness(name: str, choice: str) -> float:
+    """Return how alike two names in small letters are; 0 if they do not resemble each other."""
+    if name == choice:
+        return 2.0
+    if sorted(name) == sorted(choice):  # a more frequent slip than others that match as many
+        return 1.0
+    ratio = difflib.SequenceMatcher(None, choice, name).ratio()
+    num_unmatched = (1.0 - ratio) * (len(name) + len(choice))
+    is_part = len(name) >= _MIN_PART and name in choice
+    # Short names that differ in a few letters, such as gltf and glb, have a low ratio.
+    is_near = ratio >= 0.6 or (ratio >= 0.5 and num_unmatched < 3.5)
+    num_equal = len(list(takewhile(bool, map(eq, name, choice))))  # letters at the beginning
+    return ratio + 1e-4 * num_equal if is_near or is_part else 0.0  # which decide between equals

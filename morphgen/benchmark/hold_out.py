@@ -211,7 +211,9 @@ def _is_owner(owner: str, manifest: Manifest) -> bool:
 
 def _require_match(pattern: str, names: Sequence[str], what: str, where: str) -> None:
     if not any(fnmatchcase(name, pattern) for name in names):
-        raise BenchmarkError(f"{where}: no {what} matches {pattern!r}{nearest(pattern, names)}")
+        raise BenchmarkError(
+            f"{where}: no {what} matches {pattern!r}{nearest(pattern.strip('*?'), names)}"
+        )
 
 
 MAX_VALUE_DRAWS = 100

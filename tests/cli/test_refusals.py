@@ -42,7 +42,7 @@ REFUSALS = """
 compose arm=ur55 ee=plane => unknown arm 'ur55'; did you mean 'ur5'?
 compose arm=ur5 ee=plnae => unknown ee 'plnae'; did you mean 'plane'?
 compose arm=ur55 ee=plane => ; your own parts need --library DIR
-compose arm=bob66 ee=plane => unknown arm 'bob66'; nearest of
+compose arm=bob66 ee=plane => unknown arm 'bob66'; 42 are valid, such as arm3, arm5
 compose base=gantri arm=ur5 => unknown base 'gantri'; did you mean 'gantry'?
 compose base=gantry ee=plane ee.sise=1 => no parameter 'sise'; did you mean 'size'? valid: mo
 compose base=gantry ee=plane ee.size=5m => ee.size=5: out of range; expected 0.02 to 1 m (unit
@@ -294,7 +294,7 @@ zeroshot ur5-stick --task push --goal pose => --goal pose is for task reach
 zeroshot ur5-stick --task push --policy zero-shot => was trained on reach, not on push
 zeroshot ur5-stick --policy missing.pt => missing.pt
 zeroshot ur5-stick --policy zero-shot-pose --goal position --episodes 1 => for other observations
-view nowhere => no such file or folder, no split and no grammar
+view nowhere => no such file or folder, no robot such as ur5-plane, no split and no gr
 view arm=ur6 => unknown arm 'ur6'
 view some.npz => is not an episode of morphgen view
 view some.pt => is not a checkpoint

@@ -53,6 +53,7 @@ SPLIT = "extrapolation/primitives/reach"
         ([SPLIT], f"?split={SPLIT}"),
         (["multi_finger"], "?compose=multi_finger"),
         (["base=planar", "ee=cube"], "?robot=words:base=planar%20ee=cube"),
+        (["planar-cube"], "?robot=words:base=planar%20ee=cube"),
     ],
 )
 def test_a_target_opens_its_page(files, words, query):
@@ -62,7 +63,8 @@ def test_a_target_opens_its_page(files, words, query):
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        (["robotz"], "no such file or folder, no split and no grammar"),
+        (["robotz"], "no such file or folder, .*, no split and no grammar; .* are valid, such as"),
+        (["planar-cubw"], "'cubw' is not a part; did you mean 'cube'"),
         (["extrapolation/arm/reach"], "did you mean 'extrapolation/arms/reach'"),
         (["arm=ur6"], "did you mean 'ur5'|nearest"),
         (["/etc"], "outside of the folders"),

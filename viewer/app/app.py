@@ -239,8 +239,16 @@ def start_address(words: Sequence[str], files: FileAccess) -> Address:
         return Address("split", (word,))
     if word in grammar_names():
         return Address("compose", (word,))
+    parts = word.split("-")
+    if parts[0] in files.library.paths:
+        resolve_words(word, files)  # raises if the parts cannot be joined
+        slots = [f"{files.library.manifest(part).kind}={part}" for part in parts]
+        return Address("robot", (WORDS + " ".join(slots),))
     valid = (*split_names(), *grammar_names())
-    raise UriError(f"{word}: no such file or folder, no split and no grammar{nearest(word, valid)}")
+    raise UriError(
+        f"{word}: no such file or folder, no robot such as ur5-plane, no split and no grammar"
+        f"{nearest(word, valid)}; see morphgen list, split list and grammar list"
+    )
 
 
 def _path_address(text: str, files: FileAccess) -> Address:
