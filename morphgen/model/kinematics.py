@@ -416,6 +416,8 @@ def solve_position_ik(
         if tolerance:
             away = np.linalg.norm(error, axis=1) > tolerance
             rows, error, J_root_tool = rows[away], error[away], J_root_tool[away]
+            if not len(rows):
+                break
         step = dls_step(J_root_tool[:, :3], error, damping)
         q[rows] = np.clip(q[rows] + np.clip(step, -max_step, max_step), low, high)
     return q, positions - frame_pose(robot, q)[:, :3, 3]
