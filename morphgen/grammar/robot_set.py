@@ -18,13 +18,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import zip_longest
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import msgspec
 
-from morphgen.errors import FormatError, MorphgenError
+from morphgen.errors import FormatError, MorphgenError, shortened
 from morphgen.files import write_atomic
 from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.formats.data_files import read_json, read_text
@@ -270,8 +271,16 @@ def _prepare(config: SetConfig) -> None:
                 f"{config.folder} holds another set: its {key} is {existing.get(key)!r}, not "
                 f"{value!r}; name another folder"
             )
-    if read_text(config.folder / GRAMMAR, MAX_TEXT) != config.grammar_text:
-        raise FormatError(f"{config.folder} holds a set of another grammar; name another folder")
+    before = read_text(config.folder / GRAMMAR, MAX_TEXT)
+    if before != config.grammar_text:
+        lines = (text.split("\n") for text in (before, config.grammar_text))
+        pairs = zip_longest(*lines, fillvalue="(end)")
+        line, (old, new) = next((i, pair) for i, pair in enumerate(pairs, 1) if len({*pair}) > 1)
+        raise FormatError(
+            f"{config.folder} holds a set of another grammar {config.grammar_name!r}: line {line} "
+            f"of its {GRAMMAR} is {shortened(old)!r}, not {shortened(new)!r}; name another folder, "
+            "or delete this one"
+        )
 
 
 def _is_barely_begun(config: SetConfig) -> bool:

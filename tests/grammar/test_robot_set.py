@@ -223,7 +223,13 @@ def test_a_killed_run_resumes_to_the_same_bytes(tmp_path, jobs):
         ({"light": False}, "its light is True, not False"),
         ({"where": ("mass < 1",)}, "its where is [], not ['mass < 1']"),
         ({"grammar_name": "dice"}, "its grammar is 'cubes', not 'dice'"),
-        ({"grammar_text": "robot -> cubes\n"}, "holds a set of another grammar"),
+        (
+            {"grammar_text": "robot -> cubes\n"},
+            "holds a set of another grammar 'cubes': line 1 of its grammar.grammar is "
+            "'robot -> cubes(size=uniform(0.02, 0.2))', not 'robot -> cubes'; name another folder, "
+            "or delete this one",
+        ),
+        ({"grammar_text": "robot -> cubes(size=uniform(0.02, 0.2))"}, "line 2 of its grammar.gra"),
     ],
 )
 def test_a_set_is_continued_only_with_the_same_settings(whole, change, message):
