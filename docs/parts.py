@@ -1,4 +1,4 @@
-"""Write ``parts.md``, the catalogue of arms and end-effectors, and draw their pictures.
+"""Write ``parts.md``, the catalogue of arms, end-effectors and objects, and draw their pictures.
 
     python docs/parts.py [PART ...]
 
@@ -23,7 +23,7 @@ from morphgen.grammar.library import default_library
 PAGE = Path(__file__).with_name("parts.md")
 PICTURES = Path(__file__).parent / "images" / "parts"
 MARK = "<!-- The rest of this page is written by docs/parts.py. -->\n"
-KINDS = {"arm": "Arms", "ee": "End-effectors"}
+KINDS = {"arm": "Arms", "ee": "End-effectors", "object": "Objects"}
 """Kinds of parts that the page shows, and the titles of their sections."""
 SIZE = (200, 150)
 """Width and height of a picture [px]."""

@@ -213,11 +213,11 @@ def uri_rows(uris: Sequence[str], files: FileAccess) -> list[Row]:
 
 
 def part_rows(library: Library) -> list[Row]:
-    """Return the arms, end-effectors and bodies of a library, each as a robot of its own."""
+    """Return the arms, end-effectors, bodies and objects of a library, each on its own."""
     rows: list[Row] = []
     stored = stored_facts()
     for manifest in library.manifests():
-        if manifest.kind in ("arm", "ee") and manifest.name != "none":
+        if manifest.kind in ("arm", "ee", "object") and manifest.name != "none":
             uri = f"{WORDS}{manifest.kind}={manifest.name}"
         elif manifest.kind == "body":
             uri = f"{DERIVATION}body={manifest.name}"

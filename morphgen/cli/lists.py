@@ -17,7 +17,14 @@ from morphgen.tables import table
 if TYPE_CHECKING:  # the list of parts needs no splits
     from morphgen.splits.split import Member, Split
 
-PART_KINDS = {"bases": "base", "arms": "arm", "ees": "ee", "segments": "segment", "bodies": "body"}
+PART_KINDS = {
+    "bases": "base",
+    "arms": "arm",
+    "ees": "ee",
+    "segments": "segment",
+    "bodies": "body",
+    "objects": "object",
+}
 
 
 def list_parts(args: argparse.Namespace) -> None:

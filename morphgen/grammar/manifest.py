@@ -19,11 +19,13 @@ from morphgen.formats.records import FiniteNumber, PositiveNumber, Record, read_
 SCHEMA_FILE = Path(__file__).with_name("manifest.schema.json")
 """The JSON schema of a manifest, for editors; ``docs/part_manifest.py`` writes it."""
 
-Unit = Literal["m", "rad", "kg", ""]
+Unit = Literal["m", "rad", "kg", "N", "N s/m", ""]
 _SCALES: dict[Unit, dict[str, float]] = {
     "m": {"m": 1.0, "cm": 0.01, "mm": 0.001},
     "rad": {"rad": 1.0, "deg": math.pi / 180},
     "kg": {"kg": 1.0, "g": 0.001},
+    "N": {"N": 1.0},
+    "N s/m": {},
     "": {},
 }
 UNITS: Mapping[str, tuple[str, float]] = {
@@ -116,9 +118,10 @@ def _expected(parameter: Parameter) -> str:
     return expected + (f" (units: {units})" if units else "")
 
 
-PartKind = Literal["base", "arm", "ee", "segment", "body"]
-PART_KINDS: tuple[PartKind, ...] = ("base", "arm", "ee", "segment", "body")
-"""A segment is a piece that grammars chain; a body is a complete robot."""
+PartKind = Literal["base", "arm", "ee", "segment", "body", "object"]
+PART_KINDS: tuple[PartKind, ...] = ("base", "arm", "ee", "segment", "body", "object")
+"""A segment is a piece that grammars chain; a body is a complete robot; an object stands before a
+robot and has one joint, without a motor."""
 Number = FiniteNumber | str
 """A number, or an expression over the part's parameters such as ``${size / 2}``."""
 
@@ -174,7 +177,7 @@ class Manifest(Record, frozen=True, kw_only=True, dict=True):
     """Name of the part, the same as that of the YAML file."""
     kind: PartKind
     """Kind of the part. Only grammars use a ``segment``, which they chain, and a ``body``, which is
-    a complete robot."""
+    a complete robot. An ``object`` stands before a robot; it has one joint, without a motor."""
     summary: str
     """Description in one line, for ``morphgen list``."""
     root: str

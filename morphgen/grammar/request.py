@@ -136,6 +136,8 @@ def _with_count(production: Production, count: int) -> Production:
 
 SLOTS: tuple[PartKind, ...] = ("base", "arm", "ee")
 """Kinds of parts that a request can choose."""
+OBJECT: PartKind = "object"
+"""Kind of the parts that a request names alone, without base, arm and end-effector."""
 MAIN_PORTS: Mapping[PartKind, str] = {"base": "top", "arm": "flange"}
 """Port of each kind of part that the next part is attached to when none is named."""
 
@@ -198,7 +200,7 @@ def _slot_word(part: str, text: str, library: Library) -> str:
             + nearest(part, names)
         )
     kind = library.manifest(part).kind
-    if kind not in SLOTS:
+    if kind not in (*SLOTS, OBJECT):
         raise CompositionError(
             f"robot {text!r}: {part!r} is a {kind}, which only a grammar can use"
             + nearest(part, known_grammars(library))
@@ -210,10 +212,16 @@ def parse_request(words: Sequence[str], library: Library) -> Derivation:
     """Return the derivation of ``key=value`` words.
 
     ``base``, ``arm`` and ``ee`` choose parts; the base is ``fixed`` by default. A prefix names the
-    port of a limb: ``left.arm=ur5``. Every other key is a parameter of a part: ``ee.size=80mm``,
-    ``left.ee.mount_yaw=45deg``.
+    port of a limb: ``left.arm=ur5``. ``object`` chooses an object, alone. Every other key is a
+    parameter of a part: ``ee.size=80mm``, ``left.ee.mount_yaw=45deg``.
     """
     slots = _parse_slots(words, library)
+    if OBJECT in slots:
+        if len(slots) > 1:
+            raise CompositionError(
+                f"{', '.join(sorted(slots))}: an object is no part of a robot; compose it alone"
+            )
+        return _node(slots[OBJECT], library.manifest(slots[OBJECT].part, OBJECT))
     base = slots.pop("base", _Slot("base", "", "fixed"))
     if not slots:
         raise CompositionError(
@@ -255,12 +263,12 @@ def _parse_slots(words: Sequence[str], library: Library) -> dict[str, _Slot]:
         if not equals or not key or not value:
             raise CompositionError(f"{word!r} is not of the form key=value, such as arm=ur5")
         *port, last = key.split(".")
-        if last not in SLOTS:
+        if last not in (*SLOTS, OBJECT):
             if key in values:
                 raise CompositionError(f"{key} is given twice")
             values[key] = value
             continue
-        if len(port) > 1 or port == [""] or (port and last == "base"):
+        if len(port) > 1 or port == [""] or (port and last in ("base", OBJECT)):
             raise CompositionError(
                 f"{key}: a part is named base, arm, ee, PORT.arm or PORT.ee, such as left.arm"
             )
@@ -268,7 +276,7 @@ def _parse_slots(words: Sequence[str], library: Library) -> dict[str, _Slot]:
             raise CompositionError(f"{key} is given twice: {slots[key].part} and {value}")
         slots[key] = _Slot(last, port[0] if port else "", value)
     # A base alone is no robot; parse_request says so.
-    if any(key != "base" for key in slots):
+    if any(key not in ("base", OBJECT) for key in slots):
         slots.setdefault("base", _Slot("base", "", "fixed"))
     for key, value in values.items():
         _assign(key, value, slots, library)
@@ -324,7 +332,8 @@ def _node(
     slot: _Slot, manifest: Manifest, children: tuple[tuple[str, Derivation], ...] = ()
 ) -> Derivation:
     """Return the derivation of a slot's part with its children, defaults filled in."""
-    parameters = manifest.parameters if slot.kind == "base" else manifest.attached_parameters
+    is_root = slot.kind in ("base", OBJECT)
+    parameters = manifest.parameters if is_root else manifest.attached_parameters
     values = {}
     for name, text in slot.values.items():
         if name not in parameters:

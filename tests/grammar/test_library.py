@@ -20,7 +20,12 @@ from morphgen.grammar.request import default_name, parse_request
 from morphgen.model.kinematics import forward_kinematics
 
 LIBRARY = default_library()
-REQUESTS = {"base": "base={} arm=ur5", "arm": "arm={}", "ee": "arm=ur5 ee={}"}
+REQUESTS = {
+    "base": "base={} arm=ur5",
+    "arm": "arm={}",
+    "ee": "arm=ur5 ee={}",
+    "object": "object={}",
+}
 PARTS = {part.name: REQUESTS[part.kind] for part in LIBRARY.manifests() if part.kind in REQUESTS}
 DEGREES_OF_FREEDOM = {
     0: "none stick plane cylinder cube sphere fixed pedestal",

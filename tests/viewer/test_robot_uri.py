@@ -195,5 +195,5 @@ def test_splits_and_parts_are_listed(files):
     assert neighbour_uris(rows[1].uri, files) == (rows[0].uri, rows[2].uri)
     assert neighbour_uris(rows[0].uri, files)[0] == ""
     parts = part_rows(files.library)
-    assert {row.role for row in parts} == {"arm", "ee", "body"}
+    assert {row.role for row in parts} == {"arm", "ee", "body", "object"}
     assert "words:arm=ur5" in [row.uri for row in parts]
