@@ -27,10 +27,11 @@ LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
 
 def view(args: argparse.Namespace) -> None:
     """Serve until interrupted."""
-    with suppress(KeyboardInterrupt), warnings.catch_warnings():
-        # Work that ends after its browser has disconnected still writes to the page: harmless.
-        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
+    with suppress(KeyboardInterrupt):
         viewer = serve(args.words, args.host, args.port, args.library, args.allow_origin)
+        # Work that ends after its browser has disconnected still writes to the page: harmless. Some
+        # ends after this command, when Python waits for all threads, so that the filter stays.
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         _wait(args.host, viewer)
 
 
