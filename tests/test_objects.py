@@ -85,9 +85,9 @@ def test_urdf_of_an_object_keeps_its_joint(name, tmp_path):
         assert getattr(after, key) == pytest.approx(getattr(before, key)), key
 
 
-def pushed(thing, size):
-    """Return the object where the stick pushes it along y, and a stick upright behind it."""
-    yaw = np.arctan2(1, 0) - np.arctan2(thing.direction[1], thing.direction[0])
+def pushed(thing, sign, size):
+    """Return a scene with an upright stick, before it the object, whose joint moves by the sign."""
+    yaw = sign * np.pi / 2 - np.arctan2(thing.direction[1], thing.direction[0])
     pose = Pose(quaternion=from_rpy((0.0, 0.0, float(yaw))))
     x, y, height = (pose @ Pose(thing.contact)).position
     placed = ArticulatedObject(thing.body, replace(pose, position=(-x, -y, 0.0)))
@@ -101,11 +101,12 @@ def pushed(thing, size):
 def test_pushed_objects_move_and_stop_when_they_are_released():
     size = 0.15
     things = [
-        ArticulatedObject(composed(name, {**values, "size": size})[0])
+        (ArticulatedObject(composed(name, {**values, "size": size})[0]), sign)
         for name in OBJECTS
         for values in corners(name)[:3]
+        for sign in ((1,) if name == "drawer" else (1, -1))
     ]
-    scenes = [pushed(thing, size) for thing in things]
+    scenes = [pushed(thing, sign, size) for thing, sign in things]
     objects = [scene.object for scene in scenes]
     simulation = SIMULATORS["mujoco"].load(scenes, None, 1, torch.device("cpu"))
 
@@ -117,7 +118,7 @@ def test_pushed_objects_move_and_stop_when_they_are_released():
     assert positions_after(-size, 10) == pytest.approx(0, abs=1e-6)
     moved = positions_after(0.4 * size, 50)
     released = positions_after(-size, 50)
-    assert (moved > 0.009).all()
+    assert (moved * [sign for _, sign in things] > 0.009).all()
     assert positions_after(-size, 25) == pytest.approx(released, abs=1e-4)
     simulation.close()
 
@@ -127,7 +128,5 @@ def test_requests_name_an_object_alone(words):
     derivation, name = parse_words(words, LIBRARY)
     assert str(derivation).startswith("object=dial(size=0.15, ")
     assert name.startswith("dial")
-    with pytest.raises(
-        CompositionError, match="arm, base, object: an object is no part of a robot"
-    ):
+    with pytest.raises(CompositionError, match="an object is no part of a robot"):
         parse_request(["object=dial", "arm=ur5"], LIBRARY)

@@ -138,6 +138,7 @@ SLOTS: tuple[PartKind, ...] = ("base", "arm", "ee")
 """Kinds of parts that a request can choose."""
 OBJECT: PartKind = "object"
 """Kind of the parts that a request names alone, without base, arm and end-effector."""
+_NAMED: tuple[PartKind, ...] = (*SLOTS, OBJECT)
 MAIN_PORTS: Mapping[PartKind, str] = {"base": "top", "arm": "flange"}
 """Port of each kind of part that the next part is attached to when none is named."""
 
@@ -194,13 +195,13 @@ def known_grammars(library: Library) -> set[str]:
 def _slot_word(part: str, text: str, library: Library) -> str:
     """Return the ``key=value`` word of a part, such as ``arm=ur5``."""
     if part not in library.paths:
-        names = {name for kind in SLOTS for name in library.names(kind)} | known_grammars(library)
+        names = {name for kind in _NAMED for name in library.names(kind)} | known_grammars(library)
         raise CompositionError(
             f"robot {text!r}: there is no such bundle or URDF, and {part!r} is not a part"
             + nearest(part, names)
         )
     kind = library.manifest(part).kind
-    if kind not in (*SLOTS, OBJECT):
+    if kind not in _NAMED:
         raise CompositionError(
             f"robot {text!r}: {part!r} is a {kind}, which only a grammar can use"
             + nearest(part, known_grammars(library))
@@ -263,7 +264,7 @@ def _parse_slots(words: Sequence[str], library: Library) -> dict[str, _Slot]:
         if not equals or not key or not value:
             raise CompositionError(f"{word!r} is not of the form key=value, such as arm=ur5")
         *port, last = key.split(".")
-        if last not in (*SLOTS, OBJECT):
+        if last not in _NAMED:
             if key in values:
                 raise CompositionError(f"{key} is given twice")
             values[key] = value
@@ -290,7 +291,7 @@ def _assign(key: str, value: str, slots: Mapping[str, _Slot], library: Library) 
         slots[owner].values[name] = value
         return
     chosen = ((slot.key, library.manifest(slot.part, slot.kind)) for slot in slots.values())
-    hint = nearest(key, SLOTS, dotted_keys(chosen))
+    hint = nearest(key, _NAMED, dotted_keys(chosen))
     if owner:
         raise CompositionError(f"{key}={value}: no part is chosen for {owner!r}{hint}")
     raise CompositionError(

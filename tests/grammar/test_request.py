@@ -67,7 +67,7 @@ def test_the_name_marks_changed_parameters():
         ("arm=ur5 ee=plane ee.sise=1", "no parameter 'sise'; did you mean 'size'"),
         ("arm=ur5 arm=ur3", "arm is given twice"),
         ("arm=ur5 ee.size=1", "no part is chosen for 'ee'"),
-        ("arm=ur5 legs=4", "legs=4: unknown key 'legs'; valid: arm, base, ee, a limb such as"),
+        ("arm=ur5 legs=4", "legs=4: unknown key 'legs'; valid: arm, base, ee, object, a limb such"),
         ("arm=ur5 ee=plane ee_size=80mm", "unknown key 'ee_size'; did you mean 'ee.size'? valid: "),
         ("arm=ur5 ee=plane e.size=80mm", "chosen for 'e'; did you mean 'ee.size'? valid: arm"),
         ("left.arm=ur5 left.ee=plane left_ee_size=1", "did you mean 'left.ee.size'"),
