@@ -189,6 +189,9 @@ def init_worker(stopped: c_byte) -> None:
     """
     global _stopped
     _stopped = stopped
+    # Importing mujoco asks a process for the version of GLFW, which nothing here draws with: that
+    # process prints a traceback where its parent, this one, ends meanwhile.
+    os.environ.setdefault("MUJOCO_GL", "off")
     for each in (signal.SIGINT, *STOP_SIGNALS):
         signal.signal(each, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _interrupt)
