@@ -23,7 +23,7 @@ from morphgen.rl.baselines.path_planner import (
 )
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.articulated.envs import ArticulatedEnvs
-from morphgen.tasks.articulated.starts import ArticulatedStartSet, PathFinder, motion_poses
+from morphgen.tasks.articulated.starts import ArticulatedStartSet, PathFinder
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.push.starts import BEHIND
 from morphgen.tasks.scenes.robot_tables import RobotTables
@@ -79,7 +79,7 @@ class MotionPlanner:
         if not isinstance(starts, ArticulatedStartSet):
             raise ValueError(f"{self._robot.name} has no articulated object")
         thing = starts.thing
-        self._thing, self._edge = thing, float(max(thing.contact_box[0]))
+        self._thing, self._edge = thing, starts.edge
         ends = np.concatenate([starts.start, starts.goal])
         points = thing.placed_joint.poses(ends)[:, :3]
         low, high = points.min(axis=0) - 2 * self._edge, points.max(axis=0) + 2 * self._edge
@@ -129,24 +129,17 @@ class MotionPlanner:
         sign = 1.0 if goal > position else -1.0
         to_go = abs(goal - position) * lever
         farthest = to_go + (_SHIFTS[-1] + _BEYOND) * edge
-        end = position + sign * farthest / lever
-        poses = motion_poses(self._thing, np.array([position]), np.array([end]), TRACK)
+        ends = np.array([position]), np.array([position + sign * farthest / lever])
         step = farthest / (TRACK - 1)
         bank = unwrap_joints(self._robot, q, finder.bank)
         quickest = np.argsort(self._planner.steps(q, bank), kind="stable")[:_QUICKEST]
         found = []
         for distance in BEHIND:
-            behind = finder.behind(poses, np.array([sign]), distance * edge)
+            motions = finder.motions(*ends, distance, TRACK)
+            behind = finder.behind(motions[0], np.array([sign]), distance * edge)
             rows = np.concatenate([finder.nearest(behind[:, 0])[0, :_NEAREST], quickest])
-            count = len(rows)
-            found.append(
-                finder.follow(
-                    bank[rows],
-                    finder.tools[rows],
-                    behind.repeat(count, axis=0),
-                    poses.repeat(count, axis=0),
-                )
-            )
+            repeated = [each.repeat(len(rows), axis=0) for each in (behind, *motions)]
+            found.append(unwrap_joints(self._robot, q, finder.follow(rows, *repeated)))
         tracks = np.concatenate(found)
         tracks = tracks[np.isfinite(tracks[:, 0, 0])]
         gaps = self._gaps(tracks[:, 0], position, sign)
@@ -160,7 +153,9 @@ class MotionPlanner:
         shifts = _SHIFTS * self._edge
         poses = self._thing.placed_joint.poses(position - sign * shifts / self._thing.lever)
         n, k = len(q), len(shifts)
-        touched = ~self._space.free(np.repeat(q, k, axis=0), np.tile(poses, (n, 1))).reshape(n, k)
+        touched = ~self._finder.links.free(np.repeat(q, k, axis=0), np.tile(poses, (n, 1))).reshape(
+            n, k
+        )
         return np.where(touched.any(axis=1), shifts[touched.argmax(axis=1)], np.inf)
 
     def retreat(self, q: Array, track: Array, along: float) -> Array:

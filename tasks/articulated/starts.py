@@ -42,7 +42,10 @@ from morphgen.typing import Array
 POINTS = 7  # configurations of a certificate, from the start of the motion to its end
 CLOSE = 1e-3  # largest distance of a tool of a certificate from where it should be [m]
 
-_HEIGHTS = 0.7  # heights at which tools push, in half heights of the box at the contact point
+_HEIGHTS = 0.5  # heights at which tools push, in half heights of the box at the contact point
+_NEARER = 0.5
+"""Distance beyond that of the tool, in sizes, by which the object is moved against its motion to
+test that the robot is in its way: it must touch the robot's links."""
 _LARGEST_STEP = 1.0  # largest change of a joint between configurations of a certificate [rad or m]
 _ARRIVED = 1e-6  # distance from its goal at which inverse kinematics leaves a tool [m]
 _MARGIN = 0.02  # distance of starts and ends from the object's joint limits, in ranges of the joint
@@ -69,6 +72,7 @@ class ArticulatedStartSet(GoalSet):
     friction: float  # of its surfaces
     start: Array  # position of its joint at the start, shape (S,) [rad or m]
     goal: Array  # position that its joint must pass, shape (S,) [rad or m]
+    edge: float  # size of the object [m]
     scale: float  # scale of lengths: 1, or less for robots that reach less than 0.4 m
     ground: float  # height of the ground [m]
     obstacles: tuple[Block, ...]
@@ -203,6 +207,7 @@ def sample_starts(
             friction=config.friction,
             start=starts,
             goal=goals,
+            edge=edge,
             scale=scale,
             ground=ground,
             tried=tried,
@@ -271,6 +276,7 @@ class PathFinder:
 
     Attributes:
         space: The robot with the object, for tests of collisions.
+        links: The same without the tool point, to test what touches the object.
         bank: Free configurations without the object, with the tool near it, shape (B, dof).
         tools: Positions of their tools, shape (B, 3) [m].
     """
@@ -286,7 +292,8 @@ class PathFinder:
     def stand(self, thing: ArticulatedObject) -> bool:
         """Put the object there; return whether the robot at home does not touch it."""
         self.thing = thing
-        self.space = FreeSpace(Scene(self._robot, object=thing, ground=self._ground))
+        scene = Scene(self._robot, object=thing, ground=self._ground)
+        self.space, self.links = FreeSpace(scene), FreeSpace(without_tool(scene))
         pose = thing.placed_joint.poses(np.array(thing.body.home))
         return len(self.bank) > 0 and bool(self.space.free([self._robot.home], pose)[0])
 
@@ -295,24 +302,24 @@ class PathFinder:
         n = len(start)
         distances = np.full(n, np.nan)
         paths = np.full((n, POINTS, self._robot.dof), np.nan)
-        poses, sign = motion_poses(self.thing, start, goal), np.sign(goal - start)
+        sign = np.sign(goal - start)
         for distance in BEHIND:
             rows = np.flatnonzero(np.isnan(distances))
-            behind = self.behind(poses[rows], sign[rows], distance * self._edge)
+            motions = self.motions(start[rows], goal[rows], distance)
+            behind = self.behind(motions[0], sign[rows], distance * self._edge)
             near = self.nearest(behind[:, 0])[:, : sum(NEAREST)]
             begin = 0
             for count in NEAREST:  # most succeed from the nearest, which spares the others
                 missing = np.isnan(distances[rows])
                 rows, behind, near = rows[missing], behind[missing], near[missing]
+                motions = [each[missing] for each in motions]
                 candidates = near[:, begin : begin + count]
                 begin += count
                 m, k = candidates.shape
                 if not candidates.size:
                     break
-                goals, at = np.repeat(behind, k, axis=0), np.repeat(poses[rows], k, axis=0)
-                tools = self.tools[candidates.ravel()]
-                found = self.follow(self.bank[candidates.ravel()], tools, goals, at)
-                found = found.reshape(m, k, POINTS, -1)
+                repeated = [np.repeat(each, k, axis=0) for each in (behind, *motions)]
+                found = self.follow(candidates.ravel(), *repeated).reshape(m, k, POINTS, -1)
                 is_whole = np.isfinite(found[:, :, -1, 0])
                 of, first = np.flatnonzero(is_whole.any(axis=1)), is_whole.argmax(axis=1)
                 distances[rows[of]] = distance * self._edge
@@ -324,21 +331,39 @@ class PathFinder:
         apart = np.linalg.norm(self.tools - points[:, None], axis=2)
         return np.argsort(apart, axis=1, kind="stable")
 
+    def motions(
+        self, start: Array, goal: Array, distance: float, count: int = POINTS
+    ) -> list[Array]:
+        """Return poses of the object along motions (n,), and where it is in the robot's way.
+
+        The latter are against the motion by the distance of the tool [sizes], and more. Both have
+        the shape (n, count, 7).
+        """
+        back = np.sign(goal - start) * (distance + _NEARER) * self._edge / self.thing.lever
+        return [
+            motion_poses(self.thing, start, goal, count),
+            motion_poses(self.thing, start - back, goal - back, count),
+        ]
+
     def behind(self, poses: Array, sign: Array, distance: float) -> Array:
         """Return points behind the object along motions (n, P, 7), shape (n, P, 3) [m]."""
         n, count, _ = poses.shape
         flat = points_behind(self.thing, poses.reshape(-1, 7), sign.repeat(count), distance)
         return flat.reshape(n, count, 3)
 
-    def follow(self, q: Array, tools: Array, goals: Array, poses: Array) -> Array:
-        """Follow P points (n, P, 3) from configurations (n, dof) with tools at (n, 3).
+    def follow(
+        self, candidates: NDArray[np.int64], goals: Array, poses: Array, nearer: Array
+    ) -> Array:
+        """Follow P points (n, P, 3) from configurations of the bank by their indices, (n,).
 
         The tool stays at its height, as far as the object has that height. Return configurations
-        that are free with the object at its poses (n, P, 7), shape (n, P, dof); they are NaN from
-        where a tool does not get to its point, or not by a small step.
+        that are free with the object at its poses (n, P, 7), and whose links touch it at poses
+        that are nearer, shape (n, P, dof). They are NaN from where there is none, or where it is
+        not near the one before.
         """
+        q = self.bank[candidates]
         half = _HEIGHTS * half_height(self.thing, poses[:, 0])
-        lift = np.clip(tools[:, 2] - goals[:, 0, 2], -half, half)
+        lift = np.clip(self.tools[candidates, 2] - goals[:, 0, 2], -half, half)
         paths = np.full((*goals.shape[:2], self._robot.dof), np.nan)
         rows = np.arange(len(q))
         for point in range(goals.shape[1]):
@@ -349,9 +374,15 @@ class PathFinder:
             if point > 0:
                 good &= np.abs(q - before).max(axis=1) < _LARGEST_STEP
             good[good] = self.space.free(q[good], poses[rows[good], point])
+            good[good] = ~self.links.free(q[good], nearer[rows[good], point])
             q, rows = q[good], rows[good]
             paths[rows, point] = q
         return paths
+
+
+def without_tool(scene: Scene) -> Scene:
+    """Return a scene whose tests of collisions are of links alone, not of the tool point."""
+    return replace(scene, robot=replace(scene.robot, frames=()))
 
 
 def half_height(thing: ArticulatedObject, poses: Array) -> Array:
@@ -387,11 +418,16 @@ def start_faults(starts: ArticulatedStartSet, space: FreeSpace) -> Iterator[str]
     away = np.abs(tools - behind)
     steps = np.abs(np.diff(starts.path, axis=1)).max(axis=(1, 2))
     along = space.free(path, poses.reshape(-1, 7)).reshape(n, POINTS)
+    back = np.sign(starts.goal - starts.start) * (starts.distance + _NEARER * starts.edge)
+    back /= thing.lever
+    nearer = motion_poses(thing, starts.start - back, starts.goal - back).reshape(-1, 7)
+    touched = ~FreeSpace(without_tool(space.scene)).free(path, nearer).reshape(n, POINTS)
     for fault, is_sound in (
         ("the object's joint leaves its limits", ((ends >= low) & (ends <= high)).all(axis=0)),
         ("it starts in collision", space.free(starts.q, poses[:, 0])),
         ("its path is in collision", along.all(axis=1)),
         ("its path jumps", steps < _LARGEST_STEP),
+        ("its path does not touch the object", touched.all(axis=1)),
         (
             "the tool is not behind the object",
             (away[..., :2] < 2 * CLOSE).all(axis=(1, 2))
