@@ -176,11 +176,9 @@ class ArticulatedEnvs(TaskEnvs):
         self.formulas = ArticulatedFormulas(
             self._config, {name: rows[env_spec_index] for name, rows in tables.items()}
         )
-        gap = torch.tensor([GAP * starts.scale for starts in sets], device=device)
-        self._gap = gap[env_spec_index][:, None]
         self._end = torch.zeros(len(env_spec_index), 7, device=device)  # poses at the goals
-        # Unit vectors against the motion, in the frames of the objects' poses.
-        self._back = torch.zeros(len(env_spec_index), 3, device=device)
+        # Points before contact, in the frames of the objects' poses.
+        self._before = torch.zeros(len(env_spec_index), 3, device=device)
 
     def begin(
         self, mask: torch.Tensor, random: EpisodeRandom, layout: torch.Tensor | None
@@ -189,7 +187,7 @@ class ArticulatedEnvs(TaskEnvs):
         number = random.integers(Stream.START, self._choices.count(layout))
         start = self._choices.goals(layout, number[:, None])[:, 0]
         motion = self._motions[self._env_spec_index, start]
-        pose, end, surface, back = torch.split(motion[:, 2:], [7, 7, 3, 3], dim=1)
+        pose, end, surface, before = torch.split(motion[:, 2:], [7, 7, 3, 3], dim=1)
         formulas = self.formulas
         for kept, drawn in (
             (formulas.start, motion[:, 0]),
@@ -198,7 +196,7 @@ class ArticulatedEnvs(TaskEnvs):
             (formulas.travel, self.fraction * (motion[:, 1] - motion[:, 0]).abs()),
             (formulas.surface, surface),
             (self._end, end),
-            (self._back, back),
+            (self._before, before),
         ):
             rows = mask if kept.ndim == 1 else mask[:, None]
             kept.copy_(torch.where(rows, drawn, kept))
@@ -206,12 +204,12 @@ class ArticulatedEnvs(TaskEnvs):
 
     def target_points(self, object_pose: torch.Tensor) -> torch.Tensor:
         """Return a point behind the surface where the tool pushes, that, and its end."""
-        surface, back = self.formulas.surface, self._gap * self._back
+        surface = self.formulas.surface
         return torch.stack(
             [
                 pose[:, :3] + rotated(pose[:, 3:], point)
                 for pose, point in (
-                    (object_pose, surface + back),
+                    (object_pose, self._before),
                     (object_pose, surface),
                     (self._end, surface),
                 )
@@ -243,7 +241,7 @@ class ArticulatedEnvs(TaskEnvs):
         return {
             "fraction": self.fraction.clone(),
             "motion": torch.stack(drawn, dim=1),
-            "points": torch.cat([formulas.surface, self._end, self._back], dim=1),
+            "points": torch.cat([formulas.surface, self._end, self._before], dim=1),
         }
 
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
@@ -254,17 +252,13 @@ class ArticulatedEnvs(TaskEnvs):
         for kept, values in zip(drawn, state["motion"].unbind(1), strict=True):
             kept.copy_(values)
         parts = torch.split(state["points"], [3, 7, 3], dim=1)
-        for kept, values in zip((formulas.surface, self._end, self._back), parts, strict=True):
+        for kept, values in zip((formulas.surface, self._end, self._before), parts, strict=True):
             kept.copy_(values)
 
 
 def _motions(starts: ArticulatedStartSet) -> NDArray[np.float64]:
-    """Return rows of a set: start, goal, poses at both, surface point, direction back, (S, 22)."""
-    thing = starts.thing
-    joints, sign = thing.placed_joint, np.sign(starts.goal - starts.start)
-    back = -sign[:, None] * np.array(thing.direction)
-    surface = thing.extent(sign)[:, None] * back
-    ends = [joints.poses(starts.start), joints.poses(starts.goal)]
-    return np.concatenate(
-        [starts.start[:, None], starts.goal[:, None], *ends, surface, back], axis=1
-    )
+    """Return rows of a set: start, goal, poses there, points on the surface and before, (S, 22)."""
+    thing, sign = starts.thing, np.sign(starts.goal - starts.start)
+    ends = [thing.placed_joint.poses(each) for each in (starts.start, starts.goal)]
+    points = [thing.behind(sign, gap) for gap in (0.0, GAP * starts.scale)]
+    return np.concatenate([starts.start[:, None], starts.goal[:, None], *ends, *points], axis=1)

@@ -22,17 +22,11 @@ from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.library import default_library
 from morphgen.grammar.manifest import Manifest
 from morphgen.model.geometry import Mesh, Pose
-from morphgen.model.kinematics import solve_position_ik
-from morphgen.model.robot import Robot
+from morphgen.model.kinematics import joint_limits, solve_position_ik
+from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.articulated.config import ArticulatedConfig
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.push.starts import (
-    BEHIND,
-    NEAREST,
-    draw_starts,
-    sample_tools_in_box,
-    work_region,
-)
+from morphgen.tasks.push.starts import BEHIND, draw_starts, sample_tools_in_box, work_region
 from morphgen.tasks.scenes.obstacles import no_obstacles
 from morphgen.tasks.sim.articulated import ArticulatedObject, rotated
 from morphgen.tasks.sim.base import Block, Scene
@@ -43,9 +37,15 @@ POINTS = 7  # configurations of a certificate, from the start of the motion to i
 CLOSE = 1e-3  # largest distance of a tool of a certificate from where it should be [m]
 
 _HEIGHTS = 0.5  # heights at which tools push, in half heights of the box at the contact point
-_NEARER = 0.5
-"""Distance beyond that of the tool, in sizes, by which the object is moved against its motion to
-test that the robot is in its way: it must touch the robot's links."""
+_NEARER = (0.0, 0.4)
+"""Distances by which the object is moved against its motion, beyond where its contact point meets
+the tool, to test that the robot is in its way: in one of them it touches the robot's links [sizes].
+"""
+_NEAREST = (1, 3, 8, 20)
+"""Numbers of nearest configurations of the bank from which paths begin, in turn: between the
+fingers of an open hand many miss the object."""
+_FINGERS = 3
+"""Copies of the bank with fingers at random limits: closed fingers let nothing between them."""
 _LARGEST_STEP = 1.0  # largest change of a joint between configurations of a certificate [rad or m]
 _ARRIVED = 1e-6  # distance from its goal at which inverse kinematics leaves a tool [m]
 _MARGIN = 0.02  # distance of starts and ends from the object's joint limits, in ranges of the joint
@@ -262,13 +262,8 @@ def _draw_motions(
 def points_behind(
     thing: ArticulatedObject, poses: Array, sign: Array, distance: Array | float
 ) -> Array:
-    """Return points at a distance behind the surface where tools push, shape (n, 3) [m].
-
-    Poses of the object have the shape (n, 7), signs of the motion and distances (n,).
-    """
-    back = -sign * (thing.extent(sign) + distance)
-    local = back[:, None] * np.array(thing.direction)
-    return np.asarray(poses[:, :3] + rotated(poses[:, 3:], local))
+    """Return points in the world from where tools push, (n, 3) [m]; see ``behind``."""
+    return np.asarray(poses[:, :3] + rotated(poses[:, 3:], thing.behind(sign, distance)))
 
 
 class PathFinder:
@@ -287,7 +282,20 @@ class PathFinder:
         """Sample the bank in a box from ``low`` to ``high`` that stands on the ground."""
         self._robot, self._edge, self._ground = robot, edge, float(low[2])
         empty = FreeSpace(Scene(robot, ground=self._ground))
-        self.bank, self.tools = sample_tools_in_box(empty, low, high, rng)
+        bank, tools = sample_tools_in_box(empty, low, high, rng)
+        limits, banks, rows = joint_limits(robot), [bank], [np.arange(len(bank))]
+        fingers = [
+            j
+            for j, k in enumerate(robot.independent_joints)
+            if k not in robot.joint_chain(robot.frame(TOOL).link)
+        ]
+        for _ in range(_FINGERS if fingers else 0):
+            moved = bank.copy()
+            side = rng.integers(0, 2, (len(bank), len(fingers)))
+            moved[:, fingers] = np.take_along_axis(limits[fingers].T, side, axis=0)
+            rows.append(np.flatnonzero(empty.free(moved)))
+            banks.append(moved[rows[-1]])
+        self.bank, self.tools = np.concatenate(banks), tools[np.concatenate(rows)]
 
     def stand(self, thing: ArticulatedObject) -> bool:
         """Put the object there; return whether the robot at home does not touch it."""
@@ -307,9 +315,9 @@ class PathFinder:
             rows = np.flatnonzero(np.isnan(distances))
             motions = self.motions(start[rows], goal[rows], distance)
             behind = self.behind(motions[0], sign[rows], distance * self._edge)
-            near = self.nearest(behind[:, 0])[:, : sum(NEAREST)]
+            near = self.nearest(behind[:, 0])[:, : sum(_NEAREST)]
             begin = 0
-            for count in NEAREST:  # most succeed from the nearest, which spares the others
+            for count in _NEAREST:  # most succeed from the nearest, which spares the others
                 missing = np.isnan(distances[rows])
                 rows, behind, near = rows[missing], behind[missing], near[missing]
                 motions = [each[missing] for each in motions]
@@ -336,14 +344,11 @@ class PathFinder:
     ) -> list[Array]:
         """Return poses of the object along motions (n,), and where it is in the robot's way.
 
-        The latter are against the motion by the distance of the tool [sizes], and more. Both have
-        the shape (n, count, 7).
+        Each has the shape (n, count, 7); the distance is that of the tool [sizes].
         """
-        back = np.sign(goal - start) * (distance + _NEARER) * self._edge / self.thing.lever
-        return [
-            motion_poses(self.thing, start, goal, count),
-            motion_poses(self.thing, start - back, goal - back, count),
-        ]
+        backs = against(self.thing, start, goal, distance * self._edge, self._edge)
+        shifts = (np.zeros_like(start), *backs)
+        return [motion_poses(self.thing, start + each, goal + each, count) for each in shifts]
 
     def behind(self, poses: Array, sign: Array, distance: float) -> Array:
         """Return points behind the object along motions (n, P, 7), shape (n, P, 3) [m]."""
@@ -352,14 +357,14 @@ class PathFinder:
         return flat.reshape(n, count, 3)
 
     def follow(
-        self, candidates: NDArray[np.int64], goals: Array, poses: Array, nearer: Array
+        self, candidates: NDArray[np.int64], goals: Array, poses: Array, *nearer: Array
     ) -> Array:
         """Follow P points (n, P, 3) from configurations of the bank by their indices, (n,).
 
         The tool stays at its height, as far as the object has that height. Return configurations
-        that are free with the object at its poses (n, P, 7), and whose links touch it at poses
-        that are nearer, shape (n, P, dof). They are NaN from where there is none, or where it is
-        not near the one before.
+        that are free with the object at its poses (n, P, 7), and whose links touch it at one of
+        those that are nearer, shape (n, P, dof). They are NaN from where there is none, or where
+        it is not near the one before.
         """
         q = self.bank[candidates]
         half = _HEIGHTS * half_height(self.thing, poses[:, 0])
@@ -374,10 +379,23 @@ class PathFinder:
             if point > 0:
                 good &= np.abs(q - before).max(axis=1) < _LARGEST_STEP
             good[good] = self.space.free(q[good], poses[rows[good], point])
-            good[good] = ~self.links.free(q[good], nearer[rows[good], point])
+            touched = [~self.links.free(q[good], each[rows[good], point]) for each in nearer]
+            good[good] = np.any(touched, axis=0)
             q, rows = q[good], rows[good]
             paths[rows, point] = q
         return paths
+
+
+def against(
+    thing: ArticulatedObject, start: Array, goal: Array, distance: Array | float, edge: float
+) -> list[Array]:
+    """Return changes of the joint's position to where the object is in the way, (n,) each.
+
+    The tool is at a distance behind the surface, for motions from starts to goals (n,).
+    """
+    sign = np.sign(goal - start)
+    meets = thing.extent(sign) + distance
+    return [-sign * (meets + nearer * edge) / thing.lever for nearer in _NEARER]
 
 
 def without_tool(scene: Scene) -> Scene:
@@ -418,10 +436,11 @@ def start_faults(starts: ArticulatedStartSet, space: FreeSpace) -> Iterator[str]
     away = np.abs(tools - behind)
     steps = np.abs(np.diff(starts.path, axis=1)).max(axis=(1, 2))
     along = space.free(path, poses.reshape(-1, 7)).reshape(n, POINTS)
-    back = np.sign(starts.goal - starts.start) * (starts.distance + _NEARER * starts.edge)
-    back /= thing.lever
-    nearer = motion_poses(thing, starts.start - back, starts.goal - back).reshape(-1, 7)
-    touched = ~FreeSpace(without_tool(space.scene)).free(path, nearer).reshape(n, POINTS)
+    links = FreeSpace(without_tool(space.scene))
+    touched = np.zeros((n, POINTS), dtype=np.bool_)
+    for back in against(thing, starts.start, starts.goal, starts.distance, starts.edge):
+        nearer = motion_poses(thing, starts.start + back, starts.goal + back).reshape(-1, 7)
+        touched |= ~links.free(path, nearer).reshape(n, POINTS)
     for fault, is_sound in (
         ("the object's joint leaves its limits", ((ends >= low) & (ends <= high)).all(axis=0)),
         ("it starts in collision", space.free(starts.q, poses[:, 0])),

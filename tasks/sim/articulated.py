@@ -132,12 +132,22 @@ class ArticulatedObject:
             raise SimulationError(f"object {self.body.name!r}: its frame {TOOL!r} is on the axis")
         return lever
 
-    def extent(self, sign: Array) -> Array:
-        """Return the distance from the contact point to the surface where tools push, (n,) [m].
+    def behind(self, sign: Array, distance: Array | float) -> Array:
+        """Return points from where tools push, in the state's frame, shape (n, 3) [m].
 
-        They push from behind: a joint that moves to positive positions, sign 1, on the side that
-        is against ``direction``, and with sign -1 on the other.
+        They are at a distance (n,) [m] behind the surface at the contact point, along the path of
+        this point: against the motion of the joint, to positive positions if the sign (n,) is 1.
         """
+        length = sign * (self.extent(sign) + distance)
+        if self.joint.kind == "prismatic":
+            return np.asarray(-length[:, None] * np.array(self.direction))
+        half = -length[:, None] / self.lever / 2
+        turn = np.concatenate([np.cos(half), np.sin(half) * np.array(self.joint.unit_axis)], axis=1)
+        contact = np.array([self.contact])
+        return np.asarray(rotated(turn, contact) - contact)
+
+    def extent(self, sign: Array) -> Array:
+        """Return the distance from the contact point to the surface where tools push, (n,) [m]."""
         size, centre = np.array(self.contact_box)
         return np.asarray(size / 2 @ np.abs(self.direction) - sign * (centre @ self.direction))
 
