@@ -33,7 +33,7 @@ from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.task import GoalSet
 from morphgen.typing import Array
 
-POINTS = 7  # configurations of a certificate, from the start of the motion to its end
+POINTS = 5  # configurations of a certificate, from the start of the motion to its end
 CLOSE = 1e-3  # largest distance of a tool of a certificate from where it should be [m]
 
 _HEIGHTS = 0.5  # heights at which tools push, in half heights of the box at the contact point
@@ -85,7 +85,7 @@ class ArticulatedStartSet(GoalSet):
     """Certificates: distance of the tool behind the object's surface, shape (S,) [m]."""
     path: Array
     """Certificates: free configurations with the tool behind the object as it moves from start to
-    goal, in equal steps, shape (S, POINTS, dof)."""
+    goal, in equal steps, shape (S, POINTS, dof), in single precision to be small."""
 
     @cached_property
     def thing(self) -> ArticulatedObject:
@@ -213,7 +213,7 @@ def sample_starts(
             tried=tried,
             accepted=len(q),
             distance=distances,
-            path=paths,
+            path=paths.astype(np.float32),
             **no_obstacles(len(q)),
             **identity,
         )
@@ -375,6 +375,7 @@ class PathFinder:
             before, wanted = q, goals[rows, point]
             wanted[:, 2] += lift[rows]
             q, error = solve_position_ik(self._robot, q, wanted, tolerance=_ARRIVED)
+            q = self._in_single_precision(q)
             good = np.abs(error).max(axis=1) < CLOSE
             if point > 0:
                 good &= np.abs(q - before).max(axis=1) < _LARGEST_STEP
@@ -384,6 +385,14 @@ class PathFinder:
             q, rows = q[good], rows[good]
             paths[rows, point] = q
         return paths
+
+    def _in_single_precision(self, q: Array) -> Array:
+        """Return configurations (n, dof) as certificates hold them, within the joint limits."""
+        low, high = joint_limits(self._robot).T
+        single = q.astype(np.float32)
+        up, down = np.float32(np.inf), np.float32(-np.inf)
+        single = np.where(single < low, np.nextafter(single, up), single)
+        return np.where(single > high, np.nextafter(single, down), single).astype(np.float64)
 
 
 def against(
@@ -431,7 +440,7 @@ def start_faults(starts: ArticulatedStartSet, space: FreeSpace) -> Iterator[str]
         np.sign(starts.goal - starts.start).repeat(POINTS),
         starts.distance.repeat(POINTS),
     ).reshape(n, POINTS, 3)
-    path = starts.path.reshape(n * POINTS, -1)
+    path = starts.path.reshape(n * POINTS, -1).astype(np.float64)
     tools = MujocoKinematics(space.scene.robot).frame_pose(path)[:, :3, 3].reshape(n, POINTS, 3)
     away = np.abs(tools - behind)
     steps = np.abs(np.diff(starts.path, axis=1)).max(axis=(1, 2))
