@@ -123,6 +123,7 @@ class Entities(nn.Module):
         if "object" in observation:
             block = torch.cat([observation["object"], *tool], dim=-1)
             entries["object"] = (block[:, None], observation["object_mask"][:, None])
+        if "line" in observation:
             entries["line"] = (observation["line"][:, None], observation["object_mask"][:, None])
         if "links" in self.project:
             extra = [observation[name][..., None] for name in self.channels]
