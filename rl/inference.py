@@ -63,6 +63,7 @@ class Policy:
         seed: int,
         device: str = "cpu",
         tasks: Sequence[TaskConfig] = (),
+        interface: Interface | None = None,
     ) -> None:
         """Build the actor of a learner.
 
@@ -72,11 +73,12 @@ class Policy:
             seed: Seed of the samples.
             device: Device of the network.
             tasks: Configs of the tasks that the policy is for, as for goals that are poses.
+            interface: Actions and observations of its run; by default those of its layout.
 
         Raises:
             TaskError: If the state is of an agent that is unknown here.
         """
-        self._tasks = tuple(tasks)
+        self._tasks, self._interface = tuple(tasks), interface
         self.layout = read_record(learner["layout"], Layout, "layout", TaskError)
         """Layout of the observations that the policy was trained with."""
         self.config = policy_from(learner["policy"])
@@ -95,7 +97,9 @@ class Policy:
         an agent for robots of one size needs, and the configs of the tasks.
         """
         links, obstacles = self.layout.links, self.layout.obstacles
-        interface = policy_interface(self.config, max_links=links, obstacles=obstacles)
+        interface = self._interface or policy_interface(
+            self.config, max_links=links, obstacles=obstacles
+        )
         return vars(interface) | {"configs": self._tasks}
 
     def require(self, observation: Observation) -> None:
@@ -109,6 +113,16 @@ class Policy:
             layout = structs.replace(layout, links=self.layout.links)
         require_layout(self.layout, layout, "the checkpoint")
 
+    def _with_fields(self, observation: Observation) -> Observation:
+        """Add fields of other tasks of the policy, which no robot of this batch has."""
+        added = dict(observation)
+        links = observation["links"]
+        for name, size, mask in self.layout.fields:
+            if name not in added and mask not in observation:
+                added[name] = torch.zeros(len(links), size, device=links.device)
+                added.setdefault(mask, torch.zeros_like(links[:, 0]))
+        return added
+
     @torch.no_grad()
     def act(self, observation: Observation) -> torch.Tensor:
         """Return actions for observations, shape (n, L), on the device of the observations.
@@ -119,6 +133,7 @@ class Policy:
         Raises:
             TaskError: If the observations have another layout than those of the training.
         """
+        observation = self._with_fields(observation)
         self.require(observation)
         needed = truncate_links(observation, rows_needed(self.config, observation))
         head = self._actor.distribution({k: v.to(self._device) for k, v in needed.items()})
@@ -146,7 +161,7 @@ def load_policy(
         raise TaskError(f"unknown mode {mode!r}{nearest(str(mode), MODES)}")
     require_device(device)
     run, learner = read_checkpoint(checkpoint_path(path))
-    return Policy(learner, mode, seed, device, run.evaluation_tasks)
+    return Policy(learner, mode, seed, device, run.evaluation_tasks, run.interface)
 
 
 class PolicyController:

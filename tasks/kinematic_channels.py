@@ -201,7 +201,7 @@ class KinematicChannels:
     """The kinematic channels of a batch's environments, each of shape (n, L, size).
 
     P is the number of target points of the tasks (``TaskEnvs.target_points``); R is 1 if a task
-    wants an orientation of the tool, else 0; B is 1 if a scene has a block, else 0.
+    wants an orientation of the tool, else 0; B is 1 if a scene has an object, else 0.
 
     ``lag`` (1)
         Target minus position of the link's joint, in largest steps.
@@ -216,7 +216,8 @@ class KinematicChannels:
         displacement. For each target point: the error, and twice the product of Jacobian column
         and error (``_products``), for the tool where it is and for the tool where it will be once
         the joints are at their targets. For an orientation: the error and the product. For the
-        block: the same from the robot's nearest point, and that point's displacement.
+        object, a block's centre or a contact point: the same from the robot's nearest point, and
+        that point's displacement.
     ``dls`` (3 (P + R))
         The joint's share of a damped least-squares step of all joints (Wampler 1986) towards each
         target point, and towards the first one with its orientation, at three gains.
@@ -237,13 +238,16 @@ class KinematicChannels:
         env_robot_index: torch.Tensor,
         names: Sequence[str],
         *,
-        has_block: torch.Tensor,
+        has_object: torch.Tensor | None,
         space_of: Callable[[int], FreeSpace],
     ) -> None:
-        """Gather the tables of every environment; ``space_of`` returns its scene."""
+        """Gather the tables of every environment; ``space_of`` returns its scene.
+
+        ``has_object`` says which scenes have an object, (n,), bool; None leaves its columns out.
+        """
         index = env_robot_index
         self._names, self._index, self._tables = tuple(names), index, tables
-        self._has_block = has_block if bool(has_block.any()) else None
+        self._has_object = has_object
         self._joint, self._link_of_joint = tables.joint_of_link[index], tables.link_of_joint[index]
         self._link_mask = tables.link_mask[index]
         self._lower, self._upper = tables.lower[index], tables.upper[index]
@@ -328,9 +332,9 @@ class KinematicChannels:
             error = rotvec_from_matrix(goals.rotations @ T_root_tool[:, :3, :3].transpose(1, 2))
             error = error * goals.has_rotation[:, None]
             columns += [self._at_joints(error), self._products(angular, error)]
-        if self._has_block is not None:
+        if self._has_object is not None:
             point, J_root_point = self._nearest_point(state)
-            error = (state.object_pose[:, :3] - point) * self._has_block[:, None]
+            error = (state.object_pose[:, :3] - point) * self._has_object[:, None]
             columns.append(self._at_joints(POSITION_SCALE * error))
             columns += [COLUMN_SCALE * J_root_point * step, self._products(J_root_point, error)]
         return self._at_links(torch.cat(columns, dim=1).transpose(1, 2))

@@ -70,6 +70,10 @@ class ObservationConfig:
     """Whether to observe block and obstacles as boxes; without it they need points."""
     obstacles: int = 0
     """Minimum number of obstacle rows, for policies that meet more obstacles elsewhere."""
+    targets: int = 0
+    """Minimum number of target points in kinematic channels, for policies of several tasks."""
+    objects: bool = False
+    """Whether kinematic channels have columns of objects also where no scene has one, likewise."""
     tree_joints: int = 0
     """Minimum number of joints of ``tree_entries``, for batches after which others have more."""
 
@@ -459,9 +463,13 @@ class BatchObservation:
             )
         self._kinematics: KinematicChannels | None = None
         if names := config.kinematic_channels:
-            has_block = torch.tensor([scene.block is not None for scene in scenes], device=device)
+            has_object = torch.tensor([scene.object is not None for scene in scenes], device=device)
             self._kinematics = KinematicChannels(
-                robot_tables, index, names, has_block=has_block, space_of=layouts.space
+                robot_tables,
+                index,
+                names,
+                has_object=has_object if config.objects or bool(has_object.any()) else None,
+                space_of=layouts.space,
             )
         self._points: PointClouds | None = None
         if config.points:
@@ -501,7 +509,7 @@ class BatchObservation:
         if config.tool:
             observation["tool"] = self.tool_positions(q)
         if self._kinematics is not None:
-            goals = self._groups.tool_targets(object_pose)
+            goals = self._groups.tool_targets(object_pose, config.targets)
             observation |= self._kinematics(q, targets, goals, object_pose)
         if self._points is not None:
             observation["points"] = self._points(object_pose)

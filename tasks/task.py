@@ -358,6 +358,10 @@ class Task(ABC, Generic[C, G]):
     goal_field: str = ""
     """Observation field that begins with the desired goal of ``goal_env=True``; empty for a task
     without that form."""
+    num_targets: int = 0
+    """Number of points that ``TaskEnvs.target_points`` returns."""
+    moves_object: bool = False
+    """Whether its scenes have an object."""
     target: str = "goal"
     """Noun for the thing that ``StepResult.distance`` is measured from."""
     goal_files_readme: str = ""

@@ -226,11 +226,12 @@ class TaskGroups:
             for field in self.observation_fields
         }
 
-    def tool_targets(self, object_pose: torch.Tensor) -> ToolTargets:
-        """Return the points and orientations that the tasks want the tool at."""
+    def tool_targets(self, object_pose: torch.Tensor, least: int = 0) -> ToolTargets:
+        """Return the points, padded to a least number, and orientations that tasks want."""
         groups = self._groups.values()
         points = [group.envs.target_points(self._rows_of(group, object_pose)) for group in groups]
-        order = torch.arange(max(each.shape[1] for each in points), device=object_pose.device)
+        count = max(least, *(each.shape[1] for each in points))
+        order = torch.arange(count, device=object_pose.device)
         targets = []
         for group, values in zip(groups, points, strict=True):
             padding = (0, 0, 0, len(order) - values.shape[1])

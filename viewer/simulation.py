@@ -21,7 +21,14 @@ from morphgen.grammar.robot_source import is_robot_file
 from morphgen.rl.baselines import BASELINES, Controller
 from morphgen.rl.inference import ControllerSpec, make_env_and_controller, read_controller
 from morphgen.rl.runs.checkpoint import read_checkpoint
-from morphgen.rl.runs.robot_source import FILE, GrammarSource, OneRobot, members, read_drawn
+from morphgen.rl.runs.robot_source import (
+    FILE,
+    GrammarSource,
+    OneRobot,
+    members,
+    read_drawn,
+    tasks_of,
+)
 from morphgen.rl.shipped_policies import is_named, policies_for
 from morphgen.tasks.gym.env import TaskEnv
 from morphgen.tasks.registry import TASKS
@@ -114,7 +121,7 @@ def training_robots(policy: str, files: FileAccess) -> tuple[str, bool, list[tup
         folder = path if path.is_dir() else path.parent
         rows = read_drawn(folder) if (folder / FILE).is_file() else ()
         if not rows:
-            return source.task, source.obstacles, []
+            return tasks_of(source)[0], source.obstacles, []
     if rows:
         robots = [(row.name, f"{DERIVATION}{row.derivation}") for row in rows]
         return rows[0].task, any(row.obstacles for row in rows), robots

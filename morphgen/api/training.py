@@ -275,7 +275,8 @@ def _source_to_draw(given: SimpleNamespace) -> GrammarSource:
         )
     if given.on != "train":
         raise TaskError(f"--on {given.on}: drawn robots have no sides; --on goes with a split")
-    TASKS[task]  # raises if the task is unknown
+    for each in task.split(","):
+        TASKS[each]  # raises if the task is unknown
     return drawn_source(
         given.drawn,
         task,

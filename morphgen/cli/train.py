@@ -57,7 +57,7 @@ from morphgen.rl.runs.training import (
     subruns_of,
 )
 from morphgen.rl.shipped_policies import POLICIES, checkpoint_path
-from morphgen.splits.split_file import split_names
+from morphgen.splits.split_file import read_split, split_names
 from morphgen.tasks.registry import (
     DEFAULT_SIMULATOR,
     SIMULATORS,
@@ -65,7 +65,7 @@ from morphgen.tasks.registry import (
     evaluation_simulator,
     require_device,
 )
-from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
+from morphgen.tasks.scenes.env_specs import IN_EVERY_FILE, GoalConfig, default_configs
 
 RESUME = "with --resume"
 FINETUNING_STEPS = 100_000
@@ -240,8 +240,11 @@ def _require_startable(cell: Cell, config: RunConfig, args: argparse.Namespace) 
 
 
 def _splits(word: str) -> tuple[str, ...]:
-    """Return the split that a word names, or the splits of the benchmark."""
-    return tuple(split_names()) if word == PAPER and not Path(word).exists() else (word,)
+    """Return the split that a word names, or the splits of the benchmark: of reach and push."""
+    if word != PAPER or Path(word).exists():
+        return (word,)
+    tasks = {name: {member.task for member in read_split(name).train} for name in split_names()}
+    return tuple(name for name, used in tasks.items() if used <= {*IN_EVERY_FILE})
 
 
 def _seeds(text: str) -> list[int]:

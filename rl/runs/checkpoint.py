@@ -352,7 +352,17 @@ class RunConfig:
     def interface(self) -> Interface:
         """Actions and observations of the policy."""
         obstacles = most_obstacles(self.source, GoalConfig(tasks=self.tasks))
-        return policy_interface(self.policy, max_links=self.max_links, obstacles=obstacles)
+        interface = policy_interface(self.policy, max_links=self.max_links, obstacles=obstacles)
+        if len(names := tasks_of(self.source)) == 1:
+            return interface
+        # A robot of one of several tasks has the channels of all.
+        tasks = [TASKS[name] for name in names]
+        observe = replace(
+            interface.observe,
+            targets=max(task.num_targets for task in tasks),
+            objects=any(task.moves_object for task in tasks),
+        )
+        return replace(interface, observe=observe)
 
     def as_data(self) -> dict[str, Any]:
         """Return the config as JSON values, which ``config_from`` reads."""

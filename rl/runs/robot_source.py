@@ -80,9 +80,10 @@ class OneRobot(_Robots):
 
 @dataclass(frozen=True, kw_only=True)
 class GrammarSource(_Robots):
-    """Robots that ``draw`` draws from grammars, all at one task."""
+    """Robots that ``draw`` draws from grammars; with several tasks they have them in turn."""
 
     task: str
+    """Name of the task, or names with commas between them."""
     obstacles: bool = False
     grammars: tuple[tuple[str, int], ...]
     """Grammars, by name or path, and the number of robots to draw from each."""
@@ -195,7 +196,7 @@ def tasks_of(source: Source) -> tuple[str, ...]:
     """Return the tasks of the robots, without repetition."""
     if isinstance(source, SplitSource):
         return tuple(dict.fromkeys(member.task for member in members(source)))
-    return (source.task,)
+    return tuple(source.task.split(","))
 
 
 def other_side(source: S, side: Side) -> S:
@@ -213,7 +214,8 @@ def other_side(source: S, side: Side) -> S:
 def most_obstacles(source: Source, config: GoalConfig) -> int:
     """Return the largest number of obstacles of any robot, on both sides of the split."""
     if not isinstance(source, SplitSource):
-        return config.task_config(source.task).obstacles if source.obstacles else 0
+        counts = [config.task_config(task).obstacles for task in tasks_of(source)]
+        return max(counts) if source.obstacles else 0
     sides: tuple[Side, ...] = ("train", "test")
     both = (member for side in sides for member in members(other_side(source, side)))
     return max(
@@ -507,7 +509,9 @@ def _draw_one(
     recipe: SampledRecipe,
 ) -> tuple[Member, EnvSpec | None, str, str]:
     """Return a robot with its environments, or the reason for skipping it and its error."""
-    (member,) = factory_members((factory(recipe),), (source.task,), source.obstacles)
+    tasks = tasks_of(source)
+    task = tasks[recipe.number % len(tasks)]
+    (member,) = factory_members((factory(recipe),), (task,), source.obstacles)
     if member.robot_hash in held_out:
         return member, None, HELD_OUT, ""
     try:

@@ -49,6 +49,8 @@ class Articulated(Task[ArticulatedConfig, ArticulatedStartSet]):
     goal_format = 1
     fields = (OBJECT, BASE, JOINT)
     moves_fingers = True
+    num_targets = 3
+    moves_object = True
     relative_to_random = False
     relative_distance = False
     goal_files_readme = """\

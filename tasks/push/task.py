@@ -47,6 +47,8 @@ class Push(Task[PushConfig, PushStartSet]):
     moves_fingers = True
     reset_options: Mapping[str, tuple[int, ...]] = {"block": (3, 7)}
     goal_field = "line"
+    num_targets = 3
+    moves_object = True
     relative_to_random = False
     relative_distance = False
     target = "line"

@@ -94,6 +94,7 @@ class Reach(Task[ReachConfig, ReachGoalSet]):
     name = "reach"
     config_type = ReachConfig
     goal_set_type = ReachGoalSet
+    num_targets = 1
     goal_format = 5
     cache_folder = "goals-5"
     fields = (GOAL,)
