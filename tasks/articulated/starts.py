@@ -183,8 +183,8 @@ def sample_starts(
         if not finder.stand(thing):
             continue
         found: list[tuple[float, float, float, Array]] = []
-        tried = 0
-        while len(found) < config.num_goals and tried < _TRIES * config.num_goals:
+        tried, suits = 0, True
+        while suits and len(found) < config.num_goals and tried < _TRIES * config.num_goals:
             start, goal = _draw_motions(thing, travel, draws)
             distance, path = finder(start, goal)
             tried += len(start)
@@ -192,9 +192,9 @@ def sample_starts(
                 row for row in zip(start, goal, distance, path, strict=True) if row[2] == row[2]
             ]
             most = max(most, len(found) / tried)
-            if len(found) < _FEASIBLE * tried:
-                break
-        if len(found) < config.num_goals:
+            # Of the first batch only: smaller sets, which need no other, have the same place.
+            suits = tried > _BATCH or len(found) >= _FEASIBLE * tried
+        if not suits or len(found) < config.num_goals:
             continue
         columns = zip(*found[: config.num_goals], strict=True)
         starts, goals, distances, paths = (np.array(column) for column in columns)

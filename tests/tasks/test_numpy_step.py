@@ -13,15 +13,22 @@ from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.envs import ReachEnvs
+from morphgen.tasks.registry import TASKS
 
 ROUNDING = 1e-5
 """Largest difference of numbers of order one; codes of joint positions have angles up to 200 rad,
 which are exact to 1e-5."""
 STEPS = 20
-ROBOTS = {"reach": "arm=panda ee=panda_hand", "push": "prims"}
+OBJECTS = ("drawer", "door", "dial")
+ROBOTS = {
+    "reach": "arm=panda ee=panda_hand",
+    "push": "prims",
+    **dict.fromkeys(OBJECTS, "arm3-stick"),
+}
 CONFIGS = {
     "reach": ReachConfig(max_episode_steps=STEPS, num_goals=5, near=0.7),
     "push": PushConfig(max_episode_steps=STEPS, num_goals=5, line=-0.1),
+    **{task: TASKS[task].config_type(max_episode_steps=STEPS, num_goals=5) for task in OBJECTS},
 }
 CHANNELS = ObservationConfig(
     *(True,) * 3,
@@ -114,12 +121,13 @@ POSE = ReachConfig(max_episode_steps=STEPS, num_goals=5, goal="pose")
     [
         ("reach", "kinematic"),
         *((task, sim) for task in ("reach", "push") for sim in ("mujoco", "pybullet")),
+        *((task, "mujoco") for task in OBJECTS),
     ],
 )
 def test_steps_equal_those_of_the_batch(make, task, sim, kind):
     if sim == "pybullet":
         pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
-    obstacles = sim != "kinematic" and kind == "discrete"
+    obstacles = sim != "kinematic" and kind == "discrete" and task not in OBJECTS
     env, batch = make(task, sim=sim, kind=kind, obstacles=obstacles)
     assert env._stepper is not None
     ends, successes = run_both(env, batch, 4)
@@ -157,6 +165,19 @@ def test_push_over_the_line_terminates_as_in_the_batch(make):
         assert result[2] is result[4]["success"] is succeeds
 
 
+def test_object_at_its_goal_terminates_as_in_the_batch(make):
+    env, batch = make("door")
+    env.reset(seed=1)
+    batch.reset(1)
+    action = np.zeros(env.action_space.shape, np.float32)
+    for travel, succeeds in ((0.1, False), (-0.1, True)):
+        for each in (env.batch, batch):
+            each.groups["door"].formulas.travel.fill_(travel)
+        result = env.step(action)
+        assert_step_equals(result, env, batch.step(torch.zeros(batch.action_mask.shape)))
+        assert result[2] is result[4]["success"] is succeeds
+
+
 def test_curriculum_moves_the_line_within_an_episode(make):
     env, _ = make("push")
     action = np.zeros(env.action_space.shape, np.float32)
@@ -168,10 +189,10 @@ def test_curriculum_moves_the_line_within_an_episode(make):
     assert lines[0] > lines[1] > lines[2] == pytest.approx(CONFIGS["push"].line)
 
 
-@pytest.mark.parametrize("task", ["reach", "push"])
+@pytest.mark.parametrize("task", ["reach", "push", "door"])
 @pytest.mark.parametrize("in_numpy", [True, False])
 def test_all_channels_equal_those_of_the_batch(make, task, in_numpy):
-    env, batch = make(task, observe=CHANNELS, obstacles=True)
+    env, batch = make(task, observe=CHANNELS, obstacles=task not in OBJECTS)
     if not in_numpy:
         env._stepper = None
     run_both(env, batch, 2)
