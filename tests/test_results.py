@@ -142,7 +142,7 @@ def test_difficulty_of_robots_is_what_its_command_writes(command, tmp_path, monk
     assert (tmp_path / "rows.csv").read_bytes() == (ROOT / path).read_bytes()
 
 
-def test_difficulty_has_every_robot_of_the_shipped_splits():
+def test_difficulty_has_every_robot_of_the_splits_of_the_paper():
     rows = [
         (row["split"], row["side"], row["robot"])
         for path in DIFFICULTY_FILES
@@ -152,6 +152,7 @@ def test_difficulty_has_every_robot_of_the_shipped_splits():
         (name, side, member.name)
         for name in split_names()
         for side, member in sided_members(read_split(name))
+        if member.task in ("reach", "push")
     ]
     assert sorted(rows) == sorted(shipped)
     written = {shlex.split(command)[-1] for command in DIFFICULTY}

@@ -283,12 +283,12 @@ def stats(args: argparse.Namespace) -> None:
 
 
 def _by_robots(splits: Sequence[Split]) -> dict[str, list[Split]]:
-    """Return splits with the same robots together, by what their names have in common."""
-    groups: dict[tuple[tuple[str, ...], ...], list[Split]] = {}
+    """Return splits of one folder with the same robots, by what their names have in common."""
+    groups: dict[tuple[str, tuple[tuple[str, ...], ...]], list[Split]] = {}
     for split in splits:
         # The robots are compared in their order.
         hashes = tuple(tuple(m.robot_hash for m in split.side(side)) for side in SIDES)
-        groups.setdefault(hashes, []).append(split)
+        groups.setdefault((split.name.rpartition("/")[0], hashes), []).append(split)
     return {_common_prefix([split.name for split in group]): group for group in groups.values()}
 
 

@@ -1,4 +1,6 @@
-"""The shipped splits of the paper are what their tables of robots generate; licences of parts."""
+"""The shipped splits are what their tables of robots generate; licences of parts."""
+
+from dataclasses import replace
 
 import pytest
 
@@ -24,7 +26,8 @@ from morphgen.splits.split import SIDES
 from morphgen.splits.split_file import find_split, read_split, split_names, split_text
 
 LIBRARY = default_library()
-NAMES = [
+ARTICULATED = ("dial", "door", "drawer")
+PAPER_NAMES = [
     *(f"composition/{name}" for name in ("ee-arm/push", "ee-arm/reach", "ee-task")),
     *(f"extrapolation/{robots}/{task}" for robots in ("arms-small", "arms", "primitives")
       for task in ("push", "reach")),
@@ -32,6 +35,19 @@ NAMES = [
       for boxes in ("", "-obstacles")),
     *(f"interpolation/panda/{task}" for task in ("push", "reach")),
 ]  # fmt: skip
+ROBOTS = {
+    "composition/ee-arm": "composition/ee-arm/push",
+    "composition/ur5-plane": "composition/ee-task",
+    "extrapolation/arms-small": "extrapolation/arms-small/push",
+    "extrapolation/arms": "extrapolation/arms/push",
+    "extrapolation/primitives-sliding": "extrapolation/primitives/push",
+    "interpolation/arm3": "interpolation/arm3/push",
+    "interpolation/panda": "interpolation/panda/push",
+}
+"""The split of the paper that has the robots of those with articulated objects."""
+LEFT_OUT = {"extrapolation/primitives-sliding": {"nlink"}}
+"""Categories of robots without feasible starts."""
+NAMES = PAPER_NAMES + [f"{robots}/{task}" for robots in ROBOTS for task in ARTICULATED]
 PAPER_COUNTS = {
     "interpolation/arm3/reach": (10, 9),
     "interpolation/panda/reach": (11, 9),
@@ -60,8 +76,20 @@ def generated(split, side):
     assert next(stored, None) is None
 
 
-def test_there_are_fifteen_scenarios():
-    assert split_names() == NAMES
+def test_there_are_fifteen_scenarios_of_the_paper_and_three_tasks_with_their_robots():
+    assert split_names() == sorted(NAMES)
+
+
+@pytest.mark.parametrize("robots", ROBOTS)
+@pytest.mark.parametrize("task", ARTICULATED)
+def test_splits_with_articulated_objects_have_the_robots_of_the_paper(robots, task):
+    split, paper = read_split(f"{robots}/{task}"), read_split(ROBOTS[robots])
+    for side in SIDES:
+        assert split.side(side) == tuple(
+            replace(member, task=task)
+            for member in paper.side(side)
+            if member.category not in LEFT_OUT.get(robots, ())
+        )
 
 
 @pytest.mark.parametrize(
@@ -97,7 +125,7 @@ def test_regime_findings_are_only_the_accepted_ones(name):
 RESTRICTED_SPLITS = {
     f"{name}/{task}"
     for name in ("composition/ee-arm", "extrapolation/arms")
-    for task in ("reach", "push")
+    for task in ("reach", "push", *ARTICULATED)
 }
 
 
@@ -116,7 +144,7 @@ def test_an_unlisted_licence_counts_as_unknown():
     assert (licence.restrictions, licence.url, licence.hub_id) == ((UNKNOWN,), "", "unknown")
 
 
-def test_four_scenarios_have_a_restricted_part():
+def test_ten_scenarios_have_a_restricted_part():
     found = {}
     for name in split_names():
         for part in restricted(licenced_parts(read_split(name), LIBRARY)):

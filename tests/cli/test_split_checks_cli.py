@@ -171,7 +171,7 @@ def test_all_scenarios_have_a_row_and_pass_their_audit(run):
     _, out, _ = run("split", "stats", "--json")
     rows = json.loads(out)["rows"]
     assert {row["robots"] for row in rows} >= set(paper_rows())
-    assert sum(len(row["splits"]) for row in rows) == len(split_names()) == 15
+    assert sum(len(row["splits"]) for row in rows) == len(split_names()) == 36
     for name in split_names():
         assert run("split", "audit", name, "--strict")[0] == 0, name
 
