@@ -68,7 +68,7 @@ def test_arithmetic_keeps_units(text, expected):
         ("1 / 2m", "1:3: (1 / 2m) divides a pure number by m"),
         ("r - turn", "1:3: (r - turn) mixes units m and rad"),
         ("uniform(1m, 2kg)", "1:1: uniform(1m, 2kg) mixes units kg and m"),
-        ("3inch", "1:1: unknown unit 'inch'; valid: cm, deg, g, kg, m, mm, rad"),
+        ("3inch", "1:1: unknown unit 'inch'; valid: N, cm, deg, g, kg, m, mm, rad"),
         ("q + 1", "1:1: unknown value 'q'; valid: k, r, turn"),
         ("1 / 0", "1:3: (1 / 0) divides by zero"),
         ("1e300 * 1e300", "1:7: (1e+300 * 1e+300) is not finite"),

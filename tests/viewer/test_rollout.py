@@ -228,7 +228,10 @@ def test_a_policy_gets_the_observations_it_was_trained_with(root, files, module_
     [
         (RolloutConfig("reach", (), "zero"), "no robot is named"),
         (RolloutConfig("reach", ("robots/none",), "zero"), "no such file"),
-        (RolloutConfig("reach", ("robots/one",), "scripted"), "is for push, drawer, door and dial, not for reach"),
+        (
+            RolloutConfig("reach", ("robots/one",), "scripted"),
+            "is for push or drawer or door or dial, not for reach",
+        ),
         (RolloutConfig("push", ("robots/one",), "ik"), "is for reach, not for push"),
         (RolloutConfig("reach", ("robots/one",), "zeros"), "did you mean 'zero'"),
         (RolloutConfig("reach", ("robots/one",), "../x.pt"), "outside of the folders"),
