@@ -1,8 +1,8 @@
 """morphgen: procedural robot morphologies with embedded tasks.
 
 The public functions and the package ``tasks`` are loaded when first used, so that
-``import morphgen`` costs nothing. If Gymnasium has been imported before, the environments
-``morphgen/Reach-v0`` and ``morphgen/Push-v0`` are registered with it; see ``morphgen.tasks``.
+``import morphgen`` costs nothing. If Gymnasium has been imported before, the tasks, such as
+``morphgen/Reach-v0``, are registered with it; see ``morphgen.tasks``.
 """
 
 from __future__ import annotations

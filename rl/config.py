@@ -185,8 +185,8 @@ class PPOConfig:
     """Let the entropy bonus be the mean over a robot's joints instead of their sum, so that it
     weighs the same for robots of any size (ours)."""
     curriculum: bool = True
-    """Move the line of the push task from near to far during training; reach has no curriculum
-    (paper)."""
+    """Move the line of the push task from near to far during training (paper), and let the travel
+    of drawer, door and dial grow; reach has no curriculum."""
     bf16: bool = False  # run the networks in bfloat16, by autocast
     compile: bool = False  # run networks and losses by `torch.compile`; on a GPU as CUDA graphs
 

@@ -1,6 +1,6 @@
-"""Reach and push over batches of robots, on interchangeable simulators.
+"""Tasks over batches of robots, on interchangeable simulators.
 
-Importing this package registers ``morphgen/Reach-v0`` and ``morphgen/Push-v0`` with Gymnasium if
+Importing this package registers the tasks, such as ``morphgen/Reach-v0``, with Gymnasium if
 Gymnasium has been imported before: to import it here would cost every worker process 0.1 s.
 ``gymnasium.make("morphgen.tasks.gym.env:morphgen/Reach-v0")`` works in any order.
 """

@@ -1,4 +1,4 @@
-"""The interface of tasks: reach, push, and tasks of other packages.
+"""The interface of tasks: morphgen's own, and those of other packages.
 
 A ``Task`` is one object. It samples and certifies the goal sets of robots (``sample``,
 ``certify``), defines the scene (``scene``), and makes ``TaskEnvs``, which hold the goals of a

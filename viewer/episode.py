@@ -13,7 +13,7 @@ Arrays of robot ``i`` over T control steps, in SI units, poses as (x, y, z, qw, 
     i/q          (T + 1, J)  independent joint positions at the start and after every step
     i/tool       (T + 1, 7)  pose of the tool in the root frame, which is the world's
     i/block      (T + 1, 7)  pose of the block in the world, if there is one
-    i/<marker>   (T + 1, 7)  pose of each marker, such as ``goal`` (reach) or ``line`` (push)
+    i/<marker>   (T + 1, 7)  pose of each marker, such as ``goal`` or ``line`` (push)
     i/score      (T,)        score of every step, see ``morphgen.tasks``
     i/distance   (T,)        distance to success [m]
     i/success    (T,)        whether the step was successful

@@ -7,8 +7,9 @@ nothing, and robots that can move little share some by chance. But if most of a 
 its goals or in its configurations, then the two sets were not drawn independently, and memorised
 goals of one would count as skill with the other.
 
-The goal of reach is the pose of the tool; of push, the pose of the block at the start, together
-with the start configuration if the robots are the same.
+The goal of reach is the pose of the tool; of push, the pose of the block at the start; of drawer,
+door and dial, that of the object at the end. With the last four, the start configuration belongs to
+it if the robots are the same.
 """
 
 from __future__ import annotations

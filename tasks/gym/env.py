@@ -173,7 +173,7 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
     have the shape (links, 48).
 
     An action has a number for each joint that the task controls, in the order of their links: for
-    reach the joints between root and tool, for push fingers too. Continuous actions are fractions
+    reach the joints between root and tool, for others fingers too. Continuous actions are fractions
     of a joint's largest step, in [-1, 1]; discrete ones are indices of
     ``morphgen.tasks.actions.BINS``.
 
@@ -191,7 +191,7 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
     A copy (``copy.deepcopy``, ``pickle``) goes on exactly as the original would; with simulators
     that hold their state elsewhere, such as PyBullet, it is refused.
 
-    A task whose ``TaskEnvs`` has ``formulas``, such as reach and push, steps in NumPy on the CPU
+    A task whose ``TaskEnvs`` has ``formulas``, as all of morphgen's have, steps in NumPy on the CPU
     (``NumpyStepper``), several times as fast as the batch; all results equal the batch's to the
     rounding of single precision. Others, and goals that are poses, step the batch in torch.
 

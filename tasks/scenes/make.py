@@ -123,7 +123,7 @@ def make_batch(
     """Make environments of robots at tasks; environment i has robot i modulo their number.
 
     Args:
-        task: Name of a task, such as ``reach`` or ``push``; one for all robots, or one for each.
+        task: Name of a task, such as ``reach`` or ``drawer``; one for all robots, or one for each.
         robots: Robots, or names that ``load_robot`` accepts: words of ``morphgen compose``, a
             bundle's folder or a URDF. Their collision shapes are the fitted primitives.
         num_envs: Number of environments, n.

@@ -329,7 +329,10 @@ def study_results(folder: Path, split: Split) -> BaselineResults:
 NOTE = "MT: train robots, ZS: test robots; intervals: 95%"
 
 
-REFERENCES: Mapping[str, str] = {"reach": "jacobian", "push": "scripted"}
+REFERENCES: Mapping[str, str] = {
+    "reach": "jacobian",
+    **dict.fromkeys(("push", "drawer", "door", "dial"), "scripted"),
+}
 """Controller without learning that a policy has to beat, by task."""
 
 
