@@ -5,14 +5,15 @@ An episode's file is an ``.npz``. Its text ``about`` is JSON: ``format`` (2), ``
 ``simulator``, ``period`` (time between two moments [s]), and for every robot in ``bodies``:
 ``name``, ``place`` (its URI, see ``morphgen.viewer.robot_uri``), ``body`` (its ``robot_hash``),
 ``ground`` ([m], or null), ``obstacles`` (``size`` and ``pose`` of each), ``block`` (its edges, or
-null) and ``markers`` (``name``, ``shape`` and ``size`` of each shape that shows a goal, see
-``morphgen.tasks.task``).
+null), ``object`` (``urdf`` and ``pose`` of an articulated one, or null) and ``markers`` (``name``,
+``shape`` and ``size`` of each shape that shows a goal, see ``morphgen.tasks.task``).
 
 Arrays of robot ``i`` over T control steps, in SI units, poses as (x, y, z, qw, qx, qy, qz):
 
     i/q          (T + 1, J)  independent joint positions at the start and after every step
     i/tool       (T + 1, 7)  pose of the tool in the root frame, which is the world's
-    i/block      (T + 1, 7)  pose of the block in the world, if there is one
+    i/block      (T + 1, 7)  pose of the block, or of the object's contact point and the link that
+                             moves, in the world, if there is one
     i/<marker>   (T + 1, 7)  pose of each marker, such as ``goal`` or ``line`` (push)
     i/score      (T,)        score of every step, see ``morphgen.tasks``
     i/distance   (T,)        distance to success [m]
@@ -28,21 +29,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.encoding.robot_hash import robot_hash
-from morphgen.errors import MorphgenError
+from morphgen.errors import MorphgenError, SimulationError
 from morphgen.formats.bundle import split_colours
+from morphgen.formats.urdf.write import urdf_text
 from morphgen.formats.zip_files import read_all
-from morphgen.model.geometry import Pose
+from morphgen.model.geometry import Mesh, Pose
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
 from morphgen.tasks.registry import TASKS
+from morphgen.tasks.sim.articulated import ArticulatedObject, read_body
 from morphgen.tasks.sim.base import Block
 from morphgen.tasks.task import Marker
 from morphgen.viewer.robot_uri import FileAccess, read_robot_uri
@@ -50,7 +53,7 @@ from morphgen.viewer.robot_uri import FileAccess, read_robot_uri
 Array = NDArray[np.float32]
 
 FORMAT = 2
-BLOCK = "block"  # name of the block among the poses of a track
+BLOCK = "block"  # name of the block, or of the articulated object, among the poses of a track
 _OF_STEPS = ("score", "distance", "success")  # values of a track that every step has
 STRIDE = 2  # control steps between two frames of a film
 
@@ -58,6 +61,12 @@ STRIDE = 2  # control steps between two frames of a film
 @dataclass(frozen=True)
 class _Obstacle:
     size: Vec3
+    pose: tuple[float, float, float, float, float, float, float]
+
+
+@dataclass(frozen=True)
+class _Object:
+    urdf: str
     pose: tuple[float, float, float, float, float, float, float]
 
 
@@ -72,6 +81,7 @@ class _Body:
     obstacles: tuple[_Obstacle, ...]
     block: Vec3 | None
     markers: tuple[Marker, ...]
+    object: _Object | None = None
 
 
 @dataclass(frozen=True)
@@ -103,9 +113,10 @@ class Track:
     obstacles: tuple[Block, ...] = ()
     markers: tuple[Marker, ...] = ()  # shapes that show the goal
     block_size: tuple[float, float, float] | None = None
+    object: ArticulatedObject | None = None
     q: list[Array] = field(default_factory=list)  # positions (J,) at the start and every step
     poses: dict[str, list[Array]] = field(default_factory=dict)
-    """Poses at the same times of each marker by its name, and of the ``block`` if there is one."""
+    """Poses at the same times of each marker by its name, and of ``block`` or object if any."""
     score: list[float] = field(default_factory=list)
     distance: list[float] = field(default_factory=list)
     success: list[bool] = field(default_factory=list)
@@ -206,6 +217,7 @@ def read_episode(path: Path, files: FileAccess) -> Episode:
     except (
         *(OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError),
         msgspec.MsgspecError,
+        SimulationError,
     ) as error:
         raise EpisodeError(f"{path} is not an episode of morphgen view: {error}") from error
     return Episode(tracks=tracks, **_shared_fields(about))
@@ -230,7 +242,18 @@ def _body(track: Track) -> _Body:
         ),
         track.block_size,
         track.markers,
+        None if track.object is None else _object(track.object),
     )
+
+
+def _object(thing: ArticulatedObject) -> _Object:
+    """Return the entry of an articulated object."""
+
+    def refuse(mesh: Mesh) -> NoReturn:
+        raise EpisodeError(f"the object has a mesh, {mesh.path}; files of episodes have none")
+
+    pose = (*thing.pose.position, *thing.pose.quaternion)
+    return _Object(urdf_text(split_colours(thing.body), refuse), pose)
 
 
 def _arrays(track: Track) -> dict[str, NDArray[Any]]:
@@ -260,7 +283,11 @@ def _track(body: _Body, arrays: Mapping[str, NDArray[Any]], files: FileAccess) -
     q = arrays["q"]
     if q.ndim != 2 or not len(q):
         raise ValueError(f"q has shape {q.shape}; expected ({robot.dof},) for every moment")
-    poses = [marker.name for marker in body.markers] + [BLOCK] * (body.block is not None)
+    thing = None
+    if body.object is not None:
+        thing = ArticulatedObject(read_body(body.object.urdf), _pose(body.object.pose))
+    has_block = thing is not None or body.block is not None
+    poses = [marker.name for marker in body.markers] + [BLOCK] * has_block
     _require(arrays, {"q": (len(q), robot.dof), **dict.fromkeys(poses, (len(q), 7))})
     _require(arrays, dict.fromkeys(_OF_STEPS, (len(q) - 1,)))
     return Track(
@@ -270,6 +297,7 @@ def _track(body: _Body, arrays: Mapping[str, NDArray[Any]], files: FileAccess) -
         tuple(Block(obstacle.size, _pose(obstacle.pose)) for obstacle in body.obstacles),
         body.markers,
         body.block,
+        thing,
         list(q.astype(np.float32)),
         {name: list(arrays[name].astype(np.float32)) for name in poses},
         arrays["score"].tolist(),

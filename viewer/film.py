@@ -67,7 +67,9 @@ def make_renderer(track: Track, size: tuple[int, int]) -> Renderer:
     steps = np.linspace(0, track.num_steps, min(_FRAMED_STEPS, track.num_steps + 1)).astype(int)
     configurations = np.array([track.robot.home, *(track.q[i] for i in steps)], dtype=np.float64)
     block = None if track.block_size is None else Block(track.block_size)
-    scene = Scene(track.robot, object=block, obstacles=track.obstacles, ground=track.ground)
+    scene = Scene(
+        track.robot, object=track.object or block, obstacles=track.obstacles, ground=track.ground
+    )
     positions = [poses[i][:3] for poses in track.poses.values() for i in steps]
     points = np.array(positions, dtype=np.float64).reshape(-1, 3)
     margin = 0.0 if track.block_size is None else max(track.block_size) / 2

@@ -34,7 +34,8 @@ from morphgen.tasks.gym.env import TaskEnv
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.render.renderer import render_state
 from morphgen.tasks.scenes.env_specs import load_robot
-from morphgen.tasks.sim.base import CONTROL_PERIOD
+from morphgen.tasks.sim.articulated import ArticulatedObject
+from morphgen.tasks.sim.base import CONTROL_PERIOD, Block
 from morphgen.viewer.app.address import MAX_PLAYED
 from morphgen.viewer.episode import BLOCK, Array, Episode, Track
 from morphgen.viewer.robot_uri import (
@@ -156,6 +157,7 @@ def _start_robot(
         stack.callback(env.close)
         env.batch.reset(config.seed)
         start, env_spec = render_state(env.batch), env.env_spec
+        thing = env_spec.scene.object
         poses = {**start.markers} | ({} if start.block is None else {BLOCK: start.block})
         track = Track(
             split_colours(robot),
@@ -163,7 +165,8 @@ def _start_robot(
             env_spec.scene.ground,
             env.batch.layouts.obstacles(0),
             TASKS[env_spec.task].markers(env_spec.config, env_spec.goals),
-            env_spec.scene.block.size if env_spec.scene.block else None,
+            thing.size if isinstance(thing, Block) else None,
+            thing if isinstance(thing, ArticulatedObject) else None,
             [start.q],
             {name: [pose] for name, pose in poses.items()},
         )

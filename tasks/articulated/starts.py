@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.errors import MorphgenError, NoGoalsError, TaskError
+from morphgen.errors import NoGoalsError, TaskError
 from morphgen.formats.mjcf.write import MujocoKinematics
-from morphgen.formats.resolve import default_finder
 from morphgen.formats.rounding import as_written
-from morphgen.formats.urdf.read import robot_from_xml
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation
@@ -28,7 +25,7 @@ from morphgen.tasks.articulated.config import ArticulatedConfig
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.starts import BEHIND, draw_starts, sample_tools_in_box, work_region
 from morphgen.tasks.scenes.obstacles import no_obstacles
-from morphgen.tasks.sim.articulated import ArticulatedObject, rotated
+from morphgen.tasks.sim.articulated import ArticulatedObject, read_body, rotated
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.task import GoalSet
 from morphgen.typing import Array
@@ -92,7 +89,7 @@ class ArticulatedStartSet(GoalSet):
         """The object where it stands.
 
         Raises:
-            TaskError: If the text is not of such an object; it has no meshes.
+            SimulationError: If the text is not of such an object; it has no meshes.
         """
         x, y, z, qw, qx, qy, qz = self.place.tolist()
         pose = Pose((x, y, z), (qw, qx, qy, qz))
@@ -102,17 +99,6 @@ class ArticulatedStartSet(GoalSet):
     def goal_poses(self) -> Array:
         """Poses of the object at its goals, shape (S, 7)."""
         return self.thing.placed_joint.poses(self.goal)
-
-
-def read_body(text: str) -> Robot:
-    """Return the object of a URDF's text, which may come from strangers: it has no files."""
-    if "<mesh" in text:
-        raise TaskError("the object of a set has meshes; expected primitives")
-    where = Path("object.urdf")
-    try:
-        return robot_from_xml(text.encode(), where, default_finder(), written_frames=True)
-    except MorphgenError as error:
-        raise TaskError(f"the object of a set: {error}") from error
 
 
 def object_manifest(config: ArticulatedConfig) -> Manifest:

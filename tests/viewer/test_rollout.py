@@ -1,5 +1,6 @@
 """Rollouts equal those of ``morphgen play``; episodes are saved and loaded."""
 
+import io
 import json
 import pickle
 from concurrent.futures import Future
@@ -22,15 +23,18 @@ from morphgen.rl.runs.training import train
 from morphgen.viewer import simulation
 from morphgen.viewer.app.address import Address, parse_address
 from morphgen.viewer.app.app import start_address
+from morphgen.viewer.app.web_page import scene_server
 from morphgen.viewer.episode import EpisodeError, episode_bytes, read_episode, score_until, snapshot
-from morphgen.viewer.film import make_renderer
+from morphgen.viewer.film import _render_state, make_renderer
 from morphgen.viewer.pages.play import SIMULATOR_NAMES, default_policy
 from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.rollout import EpisodeSource, RemoteRollout, RolloutConfig
 from morphgen.viewer.scene.rollout import (
     GAP,
+    add_episode,
     episode_page,
     grid_positions,
+    show_step,
     track_area,
 )
 from morphgen.viewer.simulation import Rollout
@@ -321,3 +325,58 @@ def test_video_camera_frames_the_whole_episode(episode):
     for point in (track.poses["goal"][0][:3], tools[-1]):
         assert (low - 0.01 < point).all()
         assert (point < high + 0.01).all()
+
+
+@pytest.fixture(scope="module")
+def opened_drawer(files, module_cache):
+    """An episode in which an arm moves a drawer."""
+    config = RolloutConfig("drawer", ("words:arm=arm3 ee=stick",), "scripted", 0)
+    rollout = Rollout(config, files)
+    while rollout.advance():
+        pass
+    rollout.close()
+    return rollout.episode
+
+
+def test_an_articulated_object_moves_and_is_kept_in_files(opened_drawer, files, root):
+    (track,) = opened_drawer.tracks
+    assert track.success[-1]
+    assert track.block_size is None
+    assert [marker.name for marker in track.markers] == ["goal"]
+    content = episode_bytes(opened_drawer)
+    (root / "drawer.npz").write_bytes(content)
+    (read,) = read_episode(root / "drawer.npz", files).tracks
+    assert episode_bytes(replace(opened_drawer, tracks=[read])) == content
+    assert read.object.pose == track.object.pose
+    ends = []
+    with scene_server() as server:
+        drawn = add_episode(server.scene, opened_drawer)
+        for step in (0, track.num_steps):
+            show_step(drawn, step)
+            ends.append(drawn.tracks[0].object.T_root_link[1, 0, 3])
+    poses = np.array(track.poses["block"], dtype=np.float64)
+    moved = track.object.placed_joint.positions(poses[[0, -1]])
+    assert ends == pytest.approx(moved, abs=1e-5)
+    assert abs(moved[1] - moved[0]) > 0.12
+    renderer = make_renderer(read, (320, 240))
+    frames = [renderer.frame(_render_state(read, i)).astype(int) for i in (0, track.num_steps)]
+    renderer.close()
+    assert (np.abs(frames[0] - frames[1]).sum(axis=2) > 60).sum() > 100
+
+
+@pytest.mark.parametrize(
+    ("urdf", "message"),
+    [
+        ("<robot", "the object: "),
+        ('<robot name="a"><link name="b"><visual><geometry><mesh filename="c.stl"/>', "has meshes"),
+        ('<robot name="a"><link name="b"/></robot>', "has 0 movable joints; expected one"),
+    ],
+)
+def test_a_file_with_another_object_is_refused(urdf, message, opened_drawer, files, root):
+    content = io.BytesIO(episode_bytes(opened_drawer))
+    arrays = dict(np.load(content))
+    about = json.loads(str(arrays["about"]))
+    about["bodies"][0]["object"]["urdf"] = urdf
+    np.savez_compressed(root / "other.npz", **arrays | {"about": np.array(json.dumps(about))})
+    with pytest.raises(EpisodeError, match=message):
+        read_episode(root / "other.npz", files)

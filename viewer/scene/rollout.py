@@ -35,6 +35,7 @@ class DrawnTrack:
     track: Track
     view: RobotView
     moving: dict[str, viser.FrameHandle | viser.BoxHandle]  # markers and the block, by name
+    object: RobotView | None  # the articulated object
 
 
 @dataclass(eq=False)
@@ -75,6 +76,9 @@ def show_step(scene: RolloutScene, step: int) -> None:
         for name, handle in drawn.moving.items():
             pose = track.poses[name][i].tolist()
             handle.position, handle.wxyz = tuple(pose[:3]), tuple(pose[3:])
+        if drawn.object is not None and track.object is not None:
+            pose = track.poses[BLOCK][i][None].astype(np.float64)
+            drawn.object.set_configuration(track.object.placed_joint.positions(pose))
 
 
 def track_area(track: Track) -> tuple[Array, Array]:
@@ -108,10 +112,15 @@ def _add_track(
     moving = {m.name: _add_marker(scene, f"{name}/{m.name}", m) for m in track.markers}
     if track.block_size is not None:
         moving[BLOCK] = _add_box(scene, f"{name}/block", Block(track.block_size, Pose()), _BLOCK)
+    thing = None
+    if track.object is not None:
+        pose = track.object.pose
+        thing = add_robot(scene, track.object.body, f"{name}/object", pose.position)
+        thing.base.wxyz = pose.quaternion
     if labelled:
         foot = (0.0, 0.0, track.ground or 0.0)  # a robot moves away from a name above it
         scene.add_label(f"{name}/label", track.robot.name, position=foot, anchor="top-center")
-    return DrawnTrack(track, view, moving)
+    return DrawnTrack(track, view, moving, thing)
 
 
 def _add_marker(
