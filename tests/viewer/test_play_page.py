@@ -47,6 +47,14 @@ def test_reach_episode_can_be_scrubbed_and_stepped(see, viewer, picture):
     assert page.failures == []
 
 
+@pytest.mark.parametrize("task", ["drawer", "door", "dial"])
+def test_object_is_moved(see, picture, task):
+    page = see(f"?play={task}&robot=words:arm=arm3 ee=stick&policy=scripted")
+    page.get_by_text("success", exact=True).wait_for()
+    picture(page, f"play-{task}")
+    assert page.failures == []
+
+
 def test_url_is_shown_and_new_episodes_have_other_seeds(see, viewer):
     page = see(f"?play=reach&robot={CUBE}&policy=random")
     page.wait_for_url(re.compile(r"policy=random$"))
