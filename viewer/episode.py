@@ -44,8 +44,9 @@ from morphgen.model.geometry import Mesh, Pose
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
+from morphgen.tasks.articulated.object_file import read_body
 from morphgen.tasks.registry import TASKS
-from morphgen.tasks.sim.articulated import ArticulatedObject, read_body
+from morphgen.tasks.sim.articulated import ArticulatedObject
 from morphgen.tasks.sim.base import Block
 from morphgen.tasks.task import Marker
 from morphgen.viewer.robot_uri import FileAccess, read_robot_uri

@@ -22,10 +22,11 @@ from morphgen.model.geometry import Mesh, Pose
 from morphgen.model.kinematics import joint_limits, solve_position_ik
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.articulated.config import ArticulatedConfig
+from morphgen.tasks.articulated.object_file import read_body
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.starts import BEHIND, draw_starts, sample_tools_in_box, work_region
 from morphgen.tasks.scenes.obstacles import no_obstacles
-from morphgen.tasks.sim.articulated import ArticulatedObject, read_body, rotated
+from morphgen.tasks.sim.articulated import ArticulatedObject, rotated
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.task import GoalSet
 from morphgen.typing import Array

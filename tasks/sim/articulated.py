@@ -6,13 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 
-from morphgen.errors import MorphgenError, SimulationError
-from morphgen.formats.resolve import default_finder
-from morphgen.formats.urdf.read import robot_from_xml
+from morphgen.errors import SimulationError
 from morphgen.model.geometry import IDENTITY, Mesh, Pose, Shape
 from morphgen.model.inertia import bounding_box
 from morphgen.model.kinematics import forward_kinematics
@@ -199,21 +196,6 @@ class ArticulatedObject:
             for link in group.links
             for shape in link.collisions
         )
-
-
-def read_body(text: str) -> Robot:
-    """Return the object of a URDF's text, which may come from strangers: it has no files.
-
-    Raises:
-        SimulationError: If it is no URDF, or has meshes.
-    """
-    if "<mesh" in text:
-        raise SimulationError("the object has meshes; expected primitives")
-    where = Path("object.urdf")
-    try:
-        return robot_from_xml(text.encode(), where, default_finder(), written_frames=True)
-    except MorphgenError as error:
-        raise SimulationError(f"the object: {error}") from error
 
 
 class ObjectJoints:
