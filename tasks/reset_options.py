@@ -52,7 +52,7 @@ def place_episodes(
             raise TaskError(f"reset: {robot.name!r} at {spec.task}: {error}") from error
         if np.array_equal(start, drawn_q) and np.array_equal(block, drawn_block):
             continue  # which is free as it was drawn
-        blocks = None if spec.scene.block is None else block[None]
+        blocks = None if spec.scene.object is None else block[None]
         if not space.free(start[None], blocks)[0]:
             raise TaskError(
                 f"reset: {robot.name!r} at {spec.task}: the start q {_text(start)} collides "
