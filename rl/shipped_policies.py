@@ -35,7 +35,10 @@ _ZERO_SHOT = {
     ("reach", "position", True): _shipped("zero-shot-obstacles", "reach-obstacles"),
     ("reach", "pose", False): _shipped("zero-shot-pose", "pose"),
     ("reach", "pose", True): _shipped("zero-shot-pose-obstacles", "pose-obstacles"),
-    ("push", "position", False): _shipped("zero-shot-push", "push", "push"),
+    **{
+        (task, "position", False): _shipped(f"zero-shot-{task}", task, task)
+        for task in ("push", "drawer", "door", "dial")
+    },
 }
 """Policies of ``morphgen zeroshot`` for any robot, by task, goal and presence of obstacles."""
 POLICIES: Registry[ShippedPolicy] = Registry(

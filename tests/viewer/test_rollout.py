@@ -263,6 +263,7 @@ def test_a_rollout_is_restored_from_its_address(shared_viewer, simulator):
         ("reach", False, "zero-shot"),
         ("reach", True, "zero-shot-obstacles"),
         ("push", False, "zero-shot-push"),
+        ("door", False, "zero-shot-door"),
         ("push", True, baselines_for("push")[0]),
     ],
 )
