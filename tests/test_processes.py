@@ -57,7 +57,7 @@ def test_ctrl_c_between_a_lock_and_its_release_ends_the_pool(monkeypatch):
             signal.raise_signal(signal.SIGINT)
         return entered
 
-    results = parallel_map(time.sleep, [0.0, 1.0, 1.0], 2, chunk=1)
+    results = parallel_map(time.sleep, [0.0, 60.0, 60.0], 2, chunk=1)
     next(results)
     monkeypatch.setattr(Condition, "__enter__", interrupted)
     with pytest.raises(KeyboardInterrupt):
