@@ -41,7 +41,7 @@ class TaskState(Generic[A]):
     tool: A
     """Position of the tool, shape (k, 3) [m]."""
     object_pose: A
-    """Pose of the block, shape (k, 7); zeros if there is none."""
+    """Pose of the object, shape (k, 7); zeros if there is none."""
     limit_violation: A
     """Sum over joints of their distance outside of the limits, shape (k,) [rad and m]."""
     acceleration: A
@@ -84,7 +84,7 @@ class StepFormulas(ABC, Generic[A]):
 
     @abstractmethod
     def observe(self, object_pose: A) -> dict[str, A]:
-        """Return the task's observation fields by name from poses of the block, shape (k, 7)."""
+        """Return the task's observation fields by name from poses of the object, shape (k, 7)."""
 
 
 class TaskConfig:
@@ -138,6 +138,19 @@ class TaskConfig:
             raise TaskError(
                 f"{name}: obstacle_size {self.obstacle_size}: expected 0 < lowest <= highest"
             )
+
+
+class ObjectTaskConfig(TaskConfig):
+    """Constants of a task of moving an object: its curriculum, and weights of its reward terms."""
+
+    curriculum_steps: int
+    """Number of equal steps in which the way grows during the first half of the training."""
+    curriculum_start: float
+    """Way at the start of the training, relative to its final value."""
+    joint_limit_weight: float
+    distance_weight: float
+    success_weight: float
+    approach_weight: float
 
 
 class GoalSet:
@@ -260,7 +273,7 @@ class TaskEnvs(ABC):
                 shape (k,), int64, -1 without obstacles; None if no environment has any.
 
         Returns:
-            Joint positions at the start, shape (k, J), and poses of the block, shape (k, 7), zeros
+            Joint positions at the start, shape (k, J), and poses of the object, shape (k, 7), zeros
             if there is none. Rows outside of the mask are ignored.
         """
 
@@ -272,7 +285,7 @@ class TaskEnvs(ABC):
         """Return the task's observation fields by name, each of shape (k, size).
 
         Args:
-            object_pose: Pose of the block, shape (k, 7).
+            object_pose: Pose of the object, shape (k, 7).
         """
         return self.formulas.observe(object_pose)
 
@@ -280,7 +293,7 @@ class TaskEnvs(ABC):
         """Return points that the tool should visit, shape (k, P, 3) [m]; P is 0 by default.
 
         Args:
-            object_pose: Pose of the block, shape (k, 7).
+            object_pose: Pose of the object, shape (k, 7).
         """
         return object_pose.new_zeros(len(object_pose), 0, 3)
 
@@ -296,10 +309,10 @@ class TaskEnvs(ABC):
             options: Vectors of finite numbers: of ``Task.reset_options``, and perhaps ``q``.
             space: The robot in the scene of the episode, for tests of collisions.
             q: Joint positions at the start: those of the option ``q``, or drawn; shape (dof,).
-            object_pose: Pose of the block at the start, shape (7,); zeros without one.
+            object_pose: Pose of the object at the start, shape (7,); zeros without one.
 
         Returns:
-            Joint positions and pose of the block at the start.
+            Joint positions and pose of the object at the start.
 
         Raises:
             TaskError: If an option cannot be met; the message says why.
@@ -439,7 +452,7 @@ class Task(ABC, Generic[C, G]):
         Args:
             config: Constants of the task.
             tool_pose: Pose of the tool in the root frame, shape (7,).
-            object_pose: Pose of the block, shape (7,).
+            object_pose: Pose of the object, shape (7,).
 
         Raises:
             TaskError: If the task does not define it.
@@ -496,6 +509,35 @@ class Task(ABC, Generic[C, G]):
     def points_in_view(self, goals: G) -> Array:
         """Return points that a camera should see besides robot and obstacles, shape (m, 3)."""
         return goals.goal_poses[:, :3]
+
+
+OC = TypeVar("OC", bound=ObjectTaskConfig)
+
+
+class ObjectTask(Task[OC, G]):
+    """A task of moving an object, which ends with its success; the score is the success."""
+
+    moves_fingers = True
+    moves_object = True
+    relative_to_random = False
+    relative_distance = False
+    num_targets = 3
+
+    def episode_score(self, total: float, last: float, steps: int) -> float:
+        """Return 1 for success at the end, else 0."""
+        return last
+
+    def score_range(self, config: OC, reach: float) -> tuple[float, float]:
+        """Return the score of a failure and that of a success."""
+        return 0.0, 1.0
+
+    def outcome_fault(self, config: OC, success: bool, score: float, distance: float) -> str:
+        """Compare success with the score and with the final distance."""
+        if score != float(success):
+            return f"score {score:g} with success {str(success).lower()}; expected {success:d}"
+        if success and distance > 0:
+            return f"success at {distance:g} m from the {self.target}; expected 0"
+        return ""
 
 
 def require_returned(

@@ -21,6 +21,14 @@ from morphgen.rl.baselines.path_planner import (
     PathPlanner,
     fractions_towards,
 )
+from morphgen.rl.baselines.scripted_push import (
+    ARRIVED,
+    LEAD_STEP,
+    MAX_PLANS,
+    SETTLE_STEPS,
+    SPEED,
+    ScriptedPush,
+)
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.articulated.envs import ArticulatedEnvs
 from morphgen.tasks.articulated.starts import ArticulatedStartSet, PathFinder
@@ -31,7 +39,6 @@ from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.tasks.task import EnvSpec
 from morphgen.typing import Array
 
-SPEED = 0.006  # largest motion of the tool along its track in a control step [m]: 0.3 m/s
 TRACK = 16  # configurations of a track
 
 # Lengths are in sizes of the object (the edge of push's block); costs in control steps.
@@ -45,16 +52,12 @@ _UNFINISHED_COST = 400.0  # cost of a track that makes no part of the motion
 _CANDIDATES = 24  # tracks, the cheapest first, to which straight paths are tried
 _TREE_ITERATIONS = 1500  # random configurations of a tree where no straight path is free
 
-MAX_PLANS = 8  # maximum number of plans per episode
-LEAD, LEAD_STEP, MAX_LEAD = 0.03, 0.004, 0.25
-"""Lead of the commanded tool before the object: initial value, growth per control step in which the
-object does not move, and maximum [m]. A slender arm needs it to build up force."""
+LEAD, MAX_LEAD = 0.03, 0.25
+"""Initial and largest lead of the commanded tool before the object [m], which grows as in a push.
+"""
 MOVING = 0.02  # speed of the contact point from which the object counts as moving [m/s]
 PATIENCE = 50  # control steps in which the object must move by ``PROGRESS``; else plan again
 PROGRESS = MOVING * PATIENCE * CONTROL_PERIOD  # [m]
-ARRIVED, SETTLE_STEPS = 0.02, 15
-"""A push begins when the joints are ``ARRIVED`` from their targets [rad or m], or ``SETTLE_STEPS``
-control steps after the last waypoint."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,8 +296,6 @@ class Scripted:
 
     def __init__(self, seed: int) -> None:
         """Set up; see the controllers."""
-        from morphgen.rl.baselines.scripted_push import ScriptedPush
-
         self._push, self._articulated = ScriptedPush(seed), ScriptedArticulated(seed)
 
     def act(self, task: TaskBatch) -> torch.Tensor:

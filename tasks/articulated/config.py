@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from morphgen.errors import TaskError
-from morphgen.tasks.task import TaskConfig
+from morphgen.tasks.task import ObjectTaskConfig
 
 
 @dataclass(frozen=True)
-class ArticulatedConfig(TaskConfig):
+class ArticulatedConfig(ObjectTaskConfig):
     """Move the joint of an object by a distance or an angle, to the side that the start says.
 
     The episode ends when it is there.

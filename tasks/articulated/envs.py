@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -14,6 +13,7 @@ from morphgen.model.inertia import bounding_box
 from morphgen.tasks.articulated.config import ArticulatedConfig
 from morphgen.tasks.articulated.starts import ArticulatedStartSet
 from morphgen.tasks.observation import box_tokens
+from morphgen.tasks.push.envs import GAP, curriculum_part, push_terms
 from morphgen.tasks.random_numbers import EpisodeRandom, Stream
 from morphgen.tasks.rows import (
     GoalChoices,
@@ -27,10 +27,6 @@ from morphgen.tasks.rows import (
 )
 from morphgen.tasks.sim.articulated import ArticulatedObject, ObjectJoints
 from morphgen.tasks.task import A, EnvSpec, StepFormulas, StepResult, TaskEnvs, TaskState
-
-GAP = 0.05
-"""Distance from the surface where tools push to the point before contact, as for push [m]; it is
-scaled down for robots that reach less than 0.4 m."""
 
 
 class ArticulatedFormulas(StepFormulas[A]):
@@ -85,12 +81,7 @@ class ArticulatedFormulas(StepFormulas[A]):
             terminated=success & ~state.diverged,
             distance=to_go,
             score=choose(success, 1.0),
-            terms={
-                "joint_limits": -config.joint_limit_weight * state.limit_violation,
-                "distance": -config.distance_weight * to_go,
-                "approach": -config.approach_weight * approach,
-                "success": choose(success, config.success_weight),
-            },
+            terms=push_terms(config, to_go, approach, state.limit_violation, success),
         )
 
     def observe(self, object_pose: A) -> dict[str, A]:
@@ -226,12 +217,8 @@ class ArticulatedEnvs(TaskEnvs):
 
     def advance(self, progress: float) -> None:
         """Let the travel grow, in equal steps during the first half of the training."""
-        config = self._config
-        steps = config.curriculum_steps
-        # Twice: during the first half. The summand keeps k / steps from being rounded down.
-        reached = min(math.floor(2 * progress * steps + 1e-9), steps) / steps
-        self.fraction.fill_(config.curriculum_start + (1 - config.curriculum_start) * reached)
         formulas = self.formulas
+        self.fraction.fill_(curriculum_part(self._config, progress))
         formulas.travel.copy_(self.fraction * (formulas.goal - formulas.start).abs())
 
     def state_dict(self) -> dict[str, torch.Tensor]:
@@ -257,7 +244,10 @@ class ArticulatedEnvs(TaskEnvs):
 
 
 def _motions(starts: ArticulatedStartSet) -> NDArray[np.float64]:
-    """Return rows of a set: start, goal, poses there, points on the surface and before, (S, 22)."""
+    """Return rows of a set: start, goal, poses there, points on the surface and before, (S, 22).
+
+    The gap before the surface is scaled down for robots that reach less than 0.4 m.
+    """
     thing, sign = starts.thing, np.sign(starts.goal - starts.start)
     ends = [thing.placed_joint.poses(each) for each in (starts.start, starts.goal)]
     points = [thing.behind(sign, gap) for gap in (0.0, GAP * starts.scale)]

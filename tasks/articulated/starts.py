@@ -110,14 +110,11 @@ def object_manifest(config: ArticulatedConfig) -> Manifest:
     return manifest
 
 
-def draw_object(
-    config: ArticulatedConfig, edge: float, travel: float, rng: np.random.Generator
-) -> Robot:
+def draw_object(manifest: Manifest, edge: float, travel: float, rng: np.random.Generator) -> Robot:
     """Draw an object of a size [m] whose joint can move by more than ``travel`` [m or rad].
 
     Parameters besides size and travel are uniform in the ranges of the part's manifest.
     """
-    manifest = object_manifest(config)
     wanted = {_SIZE: edge, _TRAVEL: 1.5 * travel}
     values = {}
     for name, parameter in manifest.parameters.items():
@@ -127,13 +124,12 @@ def draw_object(
             value = round(value) if parameter.integer else value
         elif not parameter.minimum <= value <= parameter.maximum:
             raise NoGoalsError(
-                f"object {config.object!r} of a {name} of {value:.3g} m: expected "
+                f"object {manifest.name!r} of a {name} of {value:.3g} m: expected "
                 f"{parameter.minimum:g} to {parameter.maximum:g}"
             )
         values[name] = value
-    library = default_library()
-    derivation = Derivation("object", config.object, tuple(values.items()))
-    return as_written(compose(derivation, library, config.object))
+    derivation = Derivation("object", manifest.name, tuple(values.items()))
+    return as_written(compose(derivation, default_library(), manifest.name))
 
 
 def sample_starts(
@@ -156,7 +152,7 @@ def sample_starts(
     manifest = object_manifest(config)
     is_scaled = _TRAVEL in manifest.parameters
     travel = config.travel * scale if is_scaled else config.travel
-    text = urdf_text(draw_object(config, edge, travel, rng), _no_mesh)
+    text = urdf_text(draw_object(manifest, edge, travel, rng), _no_mesh)
     body = read_body(text)
     y_range = (config.y[0] * scale, config.y[1] * scale)
     low = np.array([x_range[0] - 2 * edge, y_range[0] - 2 * edge, ground])

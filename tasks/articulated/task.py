@@ -28,7 +28,7 @@ from morphgen.tasks.articulated.starts import (
 )
 from morphgen.tasks.free_space import FreeSpace, outside_limits
 from morphgen.tasks.sim.base import Scene
-from morphgen.tasks.task import OBJECT, EnvSpec, Marker, ObservationField, Task
+from morphgen.tasks.task import OBJECT, EnvSpec, Marker, ObjectTask, ObservationField
 
 if TYPE_CHECKING:
     import torch
@@ -42,17 +42,12 @@ JOINT = ObservationField("object_joint", 9, "joint_mask")
 position, and how far it is from the goal [rad or m]."""
 
 
-class Articulated(Task[ArticulatedConfig, ArticulatedStartSet]):
+class Articulated(ObjectTask[ArticulatedConfig, ArticulatedStartSet]):
     """Move the joint of an object, which has no motor, by contact within 6 s."""
 
     goal_set_type = ArticulatedStartSet
     goal_format = 1
     fields = (OBJECT, BASE, JOINT)
-    moves_fingers = True
-    num_targets = 3
-    moves_object = True
-    relative_to_random = False
-    relative_distance = False
     goal_files_readme = """\
 - drawer, door, dial: `q` (n, dof) are starts; the object's `urdf` stands at `place` (7,), and its
   joint has to move from `start` (n,) to `goal` (n,)
@@ -121,24 +116,6 @@ class Articulated(Task[ArticulatedConfig, ArticulatedStartSet]):
         from morphgen.tasks.articulated.envs import ArticulatedEnvs
 
         return ArticulatedEnvs(specs, env_spec_index, num_joints)
-
-    def episode_score(self, total: float, last: float, steps: int) -> float:
-        """Return 1 for success at the end, else 0."""
-        return last
-
-    def score_range(self, config: ArticulatedConfig, reach: float) -> tuple[float, float]:
-        """Return the score of a failure and that of a success."""
-        return 0.0, 1.0
-
-    def outcome_fault(
-        self, config: ArticulatedConfig, success: bool, score: float, distance: float
-    ) -> str:
-        """Compare success with the score and with the final distance from the goal."""
-        if score != float(success):
-            return f"score {score:g} with success {str(success).lower()}; expected {success:d}"
-        if success and distance > 0:
-            return f"success at {distance:g} m from the goal; expected 0"
-        return ""
 
     def markers(self, config: ArticulatedConfig, goals: ArticulatedStartSet) -> tuple[Marker, ...]:
         """Return a box around the contact shape, which stands where the motion ends."""

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from morphgen.errors import TaskError
-from morphgen.tasks.task import TaskConfig
+from morphgen.tasks.task import ObjectTaskConfig
 
 
 @dataclass(frozen=True)
-class PushConfig(TaskConfig):
+class PushConfig(ObjectTaskConfig):
     """Push a block across a line; the episode ends when it is across (paper, B.3)."""
 
     task: ClassVar[str] = "push"

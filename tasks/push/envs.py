@@ -23,11 +23,19 @@ from morphgen.tasks.rows import (
     positive_part,
     row_norms,
 )
-from morphgen.tasks.task import A, EnvSpec, StepFormulas, StepResult, TaskEnvs, TaskState
+from morphgen.tasks.task import (
+    A,
+    EnvSpec,
+    ObjectTaskConfig,
+    StepFormulas,
+    StepResult,
+    TaskEnvs,
+    TaskState,
+)
 from morphgen.typing import Array
 
 GAP = 0.05
-"""Distance from a face of the block to the point before contact [m], tuned on arm3 and ee-arm."""
+"""Distance from a face of an object to the point before contact [m], tuned on arm3 and ee-arm."""
 
 
 class PushFormulas(StepFormulas[A]):
@@ -142,15 +150,15 @@ class PushEnvs(TaskEnvs):
 
 
 def push_terms(
-    config: PushConfig,
+    config: ObjectTaskConfig,
     to_go: A,
     approach: A,
     limit_violation: A,
     success: A,
 ) -> dict[str, A]:
-    """Return the reward terms of push (paper, tables of reward terms), shape (k,) each.
+    """Return the reward terms of moving an object (paper, of push), shape (k,) each.
 
-    They depend on the distances of the block from the line and from the tool [m].
+    They depend on the distances of the object from its goal and from the tool [m].
     """
     return {
         "joint_limits": -config.joint_limit_weight * limit_violation,
@@ -169,7 +177,12 @@ def goal_terms(config: PushConfig, y: torch.Tensor, line: torch.Tensor) -> torch
 
 def curriculum_line(config: PushConfig, line: torch.Tensor, progress: float) -> torch.Tensor:
     """Return the position of the line in a curriculum, shape as ``line``."""
+    return line * curriculum_part(config, progress)
+
+
+def curriculum_part(config: ObjectTaskConfig, progress: float) -> float:
+    """Return the part of the way that is a success at a progress of the training, 0 to 1."""
     steps = config.curriculum_steps
     # Twice: during the first half. The summand keeps k / steps from being rounded down.
     reached = min(math.floor(2 * progress * steps + 1e-9), steps) / steps
-    return line * (config.curriculum_start + (1 - config.curriculum_start) * reached)
+    return config.curriculum_start + (1 - config.curriculum_start) * reached

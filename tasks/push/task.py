@@ -25,7 +25,7 @@ from morphgen.tasks.push.starts import (
 )
 from morphgen.tasks.scenes.obstacles import layout_faults, no_obstacles, with_obstacles
 from morphgen.tasks.sim.base import Block, Scene
-from morphgen.tasks.task import LINE, OBJECT, EnvSpec, Marker, Task
+from morphgen.tasks.task import LINE, OBJECT, EnvSpec, Marker, ObjectTask
 
 if TYPE_CHECKING:
     import torch
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _LINE_WIDTH, _LINE_HEIGHT = 0.012, 0.002  # size of the strip that shows the line [m]
 
 
-class Push(Task[PushConfig, PushStartSet]):
+class Push(ObjectTask[PushConfig, PushStartSet]):
     """Push a block across a line within 6 s."""
 
     name = "push"
@@ -44,13 +44,8 @@ class Push(Task[PushConfig, PushStartSet]):
     goal_format = 3
     cache_folder = "pushes-4"
     fields = (OBJECT, LINE)
-    moves_fingers = True
     reset_options: Mapping[str, tuple[int, ...]] = {"block": (3, 7)}
     goal_field = "line"
-    num_targets = 3
-    moves_object = True
-    relative_to_random = False
-    relative_distance = False
     target = "line"
     goal_files_readme = """\
 - push: `q` (n, dof) are starts, and `blocks` (n, 7) poses of the block, whose centre must cross
@@ -164,24 +159,6 @@ class Push(Task[PushConfig, PushStartSet]):
         from morphgen.tasks.push.envs import goal_terms
 
         return goal_terms(config, achieved[:, 0], desired[:, 0])
-
-    def episode_score(self, total: float, last: float, steps: int) -> float:
-        """Return 1 for success at the end, else 0."""
-        return last
-
-    def score_range(self, config: PushConfig, reach: float) -> tuple[float, float]:
-        """Return the score of a failure and that of a success."""
-        return 0.0, 1.0
-
-    def outcome_fault(
-        self, config: PushConfig, success: bool, score: float, distance: float
-    ) -> str:
-        """Compare success with the score and with the final distance from the line."""
-        if score != float(success):
-            return f"score {score:g} with success {str(success).lower()}; expected {success:d}"
-        if success and distance > 0:
-            return f"success at {distance:g} m from the line; expected 0"
-        return ""
 
     def markers(self, config: PushConfig, goals: PushStartSet) -> tuple[Marker, ...]:
         """Return a strip on the ground, longer than the starts of the block are spread."""
