@@ -179,13 +179,19 @@ class FreeSpace:
         """
         return self._checker.free(self._positions(q, blocks))
 
-    def free_fraction(self, start: Array, end: Array, block: Array | None = None) -> float:
+    def free_fraction(
+        self,
+        start: Array,
+        end: Array,
+        block: Array | None = None,
+        resolution: float = RESOLUTION,
+    ) -> float:
         """Return the fraction of a straight path between configurations that is free, from 0 to 1.
 
-        The path is tested at points that no joint moves more than ``RESOLUTION`` between, with the
+        The path is tested at points that no joint moves more than ``resolution`` between, with the
         block at a pose (7,) if there is one.
         """
-        count = max(math.ceil(np.abs(end - start).max() / RESOLUTION), 1) + 1
+        count = max(math.ceil(np.abs(end - start).max() / resolution), 1) + 1
         line = start + np.linspace(0, 1, count)[:, None] * (end - start)
         free = self.free(line, None if block is None else np.tile(block, (count, 1)))
         return 1.0 if free.all() else max(int(free.argmin()) - 1, 0) / (count - 1)

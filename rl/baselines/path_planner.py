@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from morphgen.model.kinematics import joint_limits
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.free_space import FreeSpace
+from morphgen.tasks.free_space import RESOLUTION, FreeSpace
 from morphgen.typing import Array
 
 FreeFraction = Callable[[Array, Array], float]
@@ -117,9 +117,18 @@ class PathPlanner:
     """Plans paths of one robot; the same seed and arguments give the same path."""
 
     def __init__(
-        self, space: FreeSpace, step: Array, seed: int, movable: NDArray[np.bool_] | None = None
+        self,
+        space: FreeSpace,
+        step: Array,
+        seed: int,
+        movable: NDArray[np.bool_] | None = None,
+        resolution: float = RESOLUTION,
     ) -> None:
-        """Set up the planner with the largest steps of the joints, and which may move, (dof,)."""
+        """Set up the planner with the largest steps of the joints, and which may move, (dof,).
+
+        Paths are tested at points that no joint moves more than ``resolution`` between.
+        """
+        self._resolution = resolution
         self.space, self._step, self._seed = space, step, seed
         self._limits = joint_limits(space.scene.robot)
         self._movable = np.ones(len(step), dtype=np.bool_) if movable is None else movable
@@ -148,7 +157,7 @@ class PathPlanner:
         Start (dof,), goals (n, dof) and vias (n, dof) are configurations; the block has a pose (7,)
         if the scene has one.
         """
-        free_fraction = partial(self.space.free_fraction, block=block)
+        free_fraction = partial(self.space.free_fraction, block=block, resolution=self._resolution)
         cost = cost or PathCost(np.zeros(len(goals)), np.full(len(goals), np.inf))
         candidates: list[tuple[float, int, Path]] = []
         for i, goal in enumerate(goals):
@@ -188,7 +197,7 @@ class PathPlanner:
         LaValle 2000); without goals, that of the start grows alone. Returns the shortened path,
         None if the trees did not meet; and the tree of the start, whose nodes can all be reached.
         """
-        free_fraction = partial(self.space.free_fraction, block=block)
+        free_fraction = partial(self.space.free_fraction, block=block, resolution=self._resolution)
         rng = np.random.default_rng([self._seed, attempt])
         # Joints that may not move have limits without width.
         limits = np.where(self._movable[:, None], self._limits, start[:, None])

@@ -44,13 +44,19 @@ TRACK = 16  # configurations of a track
 # Lengths are in sizes of the object (the edge of push's block); costs in control steps.
 _NEAREST, _QUICKEST = 16, 16
 """Starts of inverse kinematics per distance: those nearest in space, and nearest in joint space."""
-_SHIFTS = np.arange(0.05, 2.0, 0.05)
-"""Distances that the object is moved against its motion to find where it meets the robot."""
-_BEYOND = 0.5  # length of a track beyond the goal and the gap
+_BEYOND = 2.5  # length of a track beyond the goal
+_DEPTH = 0.1  # how far below the object's top the robot must touch it
+_PARTS, _MOVE, _MOVES = 4, 0.05, 5
+"""Parts of a track's step in which robots touch the object; how far it moves at a time until they
+do not, and the largest number of such motions in a part."""
+_SURPLUS = 0.1  # motion beyond the goal that a track has to make
 _LEAST_PART = 0.3  # part of the motion that a track has to make
 _UNFINISHED_COST = 400.0  # cost of a track that makes no part of the motion
 _CANDIDATES = 24  # tracks, the cheapest first, to which straight paths are tried
 _TREE_ITERATIONS = 1500  # random configurations of a tree where no straight path is free
+_RESOLUTION = 0.01
+"""Largest change of a joint between tested configurations of a path [rad or m]: in steps of 5 cm a
+stick passes through a panel."""
 
 LEAD, MAX_LEAD = 0.03, 0.25
 """Initial and largest lead of the commanded tool before the object [m], which grows as in a push.
@@ -66,9 +72,9 @@ class Plan:
 
     path: tuple[Array, ...]  # waypoints, each (dof,)
     track: Array  # configurations, shape (TRACK, dof)
+    moves: Array  # motions of the object that its configurations make, shape (TRACK,) [m]
     step: float  # motion of the contact point between two of them [m]
     length: float  # motion of the contact point up to the last sound one [m]
-    gap: float  # distance of the robot from the object along the track [m]
 
 
 class MotionPlanner:
@@ -91,7 +97,9 @@ class MotionPlanner:
         self._finder.stand(thing)
         self._space = self._finder.space
         step = tables.max_step[robot, : self._robot.dof].double().cpu().numpy()
-        self._planner = PathPlanner(self._space, step, int(rng.integers(2**63)))
+        self._planner = PathPlanner(
+            self._space, step, int(rng.integers(2**63)), resolution=_RESOLUTION
+        )
 
     def plan(
         self, q: Array, position: float, goal: float, attempt: int, steps_left: float
@@ -99,11 +107,13 @@ class MotionPlanner:
         """Return the cheapest plan from a configuration (dof,) and a position of the joint."""
         joints = self._thing.placed_joint
         pose = joints.poses(np.array([position]))[0]
-        tracks, gaps, parts, step = self._tracks(q, position, goal)
+        tracks, moves, step = self._tracks(q, position, goal, attempt)
         if not len(tracks):
             return None
-        steps = self._planner.steps(tracks[:, :-1], tracks[:, 1:])
-        length = np.nansum(steps, axis=1)
+        wanted = abs(goal - position) * self._thing.lever + _SURPLUS * self._edge
+        parts = np.minimum(np.nanmax(moves, axis=1) / wanted, 1.0)
+        steps = np.maximum(self._planner.steps(tracks[:, :-1], tracks[:, 1:]), step / SPEED)
+        length = np.nansum(np.where(moves[:, :-1] < wanted, steps, 0.0), axis=1)
         cost = PathCost(length + _UNFINISHED_COST * (1 - parts), steps_left - length)
         order = np.argsort(cost.of(self._planner.steps(q, tracks[:, 0])), kind="stable")
         order = order[:_CANDIDATES]
@@ -119,52 +129,69 @@ class MotionPlanner:
             return None
         best = order[path.goal]
         track = tracks[best]
-        last = int(np.isfinite(track[:, 0]).sum()) - 1
-        track[last + 1 :] = track[last]
-        return Plan(path.waypoints, track, step, last * step, float(gaps[best]))
+        last = int(np.isfinite(moves[best]).sum()) - 1
+        track[last + 1 :], moves[best, last + 1 :] = track[last], moves[best, last]
+        return Plan(path.waypoints, track, moves[best], step, last * step)
 
-    def _tracks(self, q: Array, position: float, goal: float) -> tuple[Array, Array, Array, float]:
-        """Return tracks (n, TRACK, dof), their gaps and parts of the motion (n,), and their step.
+    def _tracks(
+        self, q: Array, position: float, goal: float, attempt: int
+    ) -> tuple[Array, Array, float]:
+        """Return tracks (n, TRACK, dof), the motions that they make (n, TRACK), and their step.
 
-        A track is NaN from where it is not sound.
+        Both are NaN from where a track is not sound. Each attempt starts from other configurations.
         """
         lever, edge, finder = self._thing.lever, self._edge, self._finder
         sign = 1.0 if goal > position else -1.0
         to_go = abs(goal - position) * lever
-        farthest = to_go + (_SHIFTS[-1] + _BEYOND) * edge
+        farthest = to_go + _BEYOND * edge
         ends = np.array([position]), np.array([position + sign * farthest / lever])
         step = farthest / (TRACK - 1)
         bank = unwrap_joints(self._robot, q, finder.bank)
-        quickest = np.argsort(self._planner.steps(q, bank), kind="stable")[:_QUICKEST]
+        quickest = np.argsort(self._planner.steps(q, bank), kind="stable")
+        quickest = quickest[attempt * _QUICKEST :][:_QUICKEST]
         found = []
         for distance in BEHIND:
             motions = finder.motions(*ends, distance, TRACK)
             behind = finder.behind(motions[0], np.array([sign]), distance * edge)
-            rows = np.concatenate([finder.nearest(behind[:, 0])[0, :_NEAREST], quickest])
+            nearest = finder.nearest(behind[:, 0])[0, attempt * _NEAREST :][:_NEAREST]
+            rows = np.concatenate([nearest, quickest])
             repeated = [each.repeat(len(rows), axis=0) for each in (behind, *motions)]
             found.append(unwrap_joints(self._robot, q, finder.follow(rows, *repeated)))
         tracks = np.concatenate(found)
         tracks = tracks[np.isfinite(tracks[:, 0, 0])]
-        gaps = self._gaps(tracks[:, 0], position, sign)
-        made = (np.isfinite(tracks[:, :, 0]).sum(axis=1) - 1) * step - gaps
-        parts = np.clip(made / max(to_go, 1e-9), 0.0, 1.0)
-        good = np.isfinite(gaps) & (parts >= _LEAST_PART)
-        return tracks[good], gaps[good], parts[good], step
+        moves = self._moves(tracks, position, sign, step)
+        good = np.nanmax(moves, axis=1) >= _LEAST_PART * to_go
+        return tracks[good], moves[good], step
 
-    def _gaps(self, q: Array, position: float, sign: float) -> Array:
-        """Return how far robots (n, dof) are from the object along its motion, (n,) [m], or inf."""
-        shifts = _SHIFTS * self._edge
-        poses = self._thing.placed_joint.poses(position - sign * shifts / self._thing.lever)
-        n, k = len(q), len(shifts)
-        touched = ~self._finder.links.free(np.repeat(q, k, axis=0), np.tile(poses, (n, 1))).reshape(
-            n, k
-        )
-        return np.where(touched.any(axis=1), shifts[touched.argmax(axis=1)], np.inf)
+    def _moves(self, tracks: Array, position: float, sign: float, step: float) -> Array:
+        """Return how far robots on tracks (n, TRACK, dof) move the object, (n, TRACK) [m].
 
-    def retreat(self, q: Array, track: Array, along: float) -> Array:
-        """Return the configuration of a track that is behind the object, free of collisions."""
-        near = track[max(int(along), 0)]
-        return near if np.isfinite(near).all() else q
+        It moves on where they touch it, as if it stopped at once. It is lower than it is, as where
+        they graze its top they slip over it. NaN is from where it cannot get out of their way.
+        """
+        moves = np.full(tracks.shape[:2], np.nan)
+        moves[:, 0], edge = 0.0, self._edge
+        for point in range(TRACK - 1):
+            moved = moves[:, point].copy()
+            for part in np.linspace(0, 1, _PARTS + 1)[1:]:
+                q = tracks[:, point] + part * (tracks[:, point + 1] - tracks[:, point])
+                moved = np.where(np.isfinite(q[:, 0]), moved, np.nan)
+                rows, tries = np.flatnonzero(np.isfinite(moved)), 0
+                while len(rows):
+                    change = sign * moved[rows] / self._thing.lever
+                    poses = self._thing.placed_joint.poses(position + change)
+                    poses[:, 2] -= _DEPTH * edge
+                    rows = rows[~self._finder.links.free(q[rows], poses)]
+                    moved[rows] += _MOVE * edge if tries < _MOVES else np.nan
+                    tries += 1
+                    rows = rows[np.isfinite(moved[rows])]
+            moves[:, point + 1] = moved
+        return moves
+
+    def retreat(self, q: Array, track: Array, along: float, position: float) -> Array:
+        """Return a configuration free of collisions: q, or that of a track behind the object."""
+        pose = self._thing.placed_joint.poses(np.array([position]))
+        return q if self._space.free([q], pose)[0] else track[min(max(int(along), 0), TRACK - 1)]
 
 
 class ScriptedArticulated:
@@ -192,7 +219,8 @@ class ScriptedArticulated:
         failed = self._advance(task, position) | (self.ours & ~self._active)
         for env in torch.nonzero(new | (failed & (self._num_plans < MAX_PLANS)))[:, 0].tolist():
             self._plan(task, env, float(position[env]), float(goal[env]), is_new=bool(new[env]))
-        targets = torch.where(self._pushing[:, None], self._along_track(), self._follower.waypoint)
+        on_track = self._on_track(self._track)
+        targets = torch.where(self._pushing[:, None], on_track, self._follower.waypoint)
         targets = torch.where(self._active[:, None], targets, task.targets)
         return encode_actions(fractions_towards(task, targets), task.action_kind)
 
@@ -213,8 +241,8 @@ class ScriptedArticulated:
             3, n, dtype=torch.int64, device=device
         )
         self._track = task.targets[:, None].repeat(1, TRACK, 1)
-        # Step and length of the track, gap of the plan.
-        self._step, self._length, self._gap = torch.zeros(3, n, device=device)
+        self._moves = torch.zeros(n, TRACK, device=device)
+        self._step, self._length = torch.zeros(2, n, device=device)  # of the track
         # Lead and place of the commanded tool; the object's best motion, its position when the plan
         # began, and its lever with the sign of the motion.
         self._lead, self._along, self._best, self._begun, self._lever = torch.zeros(
@@ -246,7 +274,7 @@ class ScriptedArticulated:
         if self._pushing[env] and not is_new:
             moved = float((position - self._begun[env]) * self._lever[env])
             track = self._track[env, :, :dof].double().cpu().numpy()
-            start = planner.retreat(q, track, moved / float(self._step[env]))
+            start = planner.retreat(q, track, moved / float(self._step[env]), position)
         steps_left = int(task.max_episode_steps[env] - task.episode_step[env])
         plan = planner.plan(start, position, goal, int(self._num_plans[env]), steps_left)
         self._num_plans[env] += 1
@@ -256,7 +284,8 @@ class ScriptedArticulated:
         way = plan.path if start is q else (start, *plan.path)
         self._follower.follow(env, way)
         self._track[env, :, :dof] = torch.from_numpy(plan.track).to(self._track)
-        self._step[env], self._length[env], self._gap[env] = plan.step, plan.length, plan.gap
+        self._moves[env] = torch.from_numpy(plan.moves).to(self._moves)
+        self._step[env], self._length[env] = plan.step, plan.length
         lever = spec.goals.thing.lever  # type: ignore[attr-defined]  # a set of this task
         self._lever[env] = lever if goal > position else -lever
         self._begun[env], self._best[env], self._along[env] = position, 0.0, 0.0
@@ -271,24 +300,25 @@ class ScriptedArticulated:
         moved = (position - self._begun) * self._lever
         progress = moved > self._best + PROGRESS
         self._best = torch.where(progress, moved, self._best)
-        self._still = torch.where(progress | ~self._pushing, 0, self._still + 1)
-        ahead = self._along - moved - self._gap
+        expected = self._on_track(self._moves)
+        self._still = torch.where(progress | (expected == 0), 0, self._still + 1)
+        ahead = expected - moved
         grow = self._pushing & (self._still > 2) & (ahead > self._lead - SPEED)
         self._lead = torch.where(grow, self._lead + LEAD_STEP, self._lead).clamp(max=MAX_LEAD)
         go = self._pushing & (ahead < self._lead)
         self._along = torch.minimum(self._along + torch.where(go, SPEED, 0.0), self._length)
-        slow = self._still > PATIENCE + self._gap / SPEED
-        failed: torch.Tensor = slow & self._active & self._pushing
+        stuck = self._pushing & (self._still > PATIENCE)
+        failed: torch.Tensor = self._active & (stuck | (moved < -PROGRESS))
         return failed
 
-    def _along_track(self) -> torch.Tensor:
-        """Return the configurations of the tracks where the commanded tools are, (n, J)."""
+    def _on_track(self, values: torch.Tensor) -> torch.Tensor:
+        """Return values along tracks (n, TRACK, ...) where the commanded tools are, (n, ...)."""
         at = (self._along / self._step.clamp(min=1e-9)).clamp(0, TRACK - 1)
         low = at.floor().long().clamp(max=TRACK - 2)
         envs = torch.arange(len(at), device=at.device)
-        part = (at - low)[:, None]
-        targets: torch.Tensor = torch.lerp(self._track[envs, low], self._track[envs, low + 1], part)
-        return targets
+        part = (at - low).view(-1, *(1,) * (values.ndim - 2))
+        there: torch.Tensor = torch.lerp(values[envs, low], values[envs, low + 1], part)
+        return there
 
 
 class Scripted:

@@ -217,15 +217,19 @@ def test_followers_take_paths_of_any_length(slider_batch):
     assert follower.waypoint[1].numpy() == pytest.approx(other, abs=1e-6)
 
 
+@pytest.mark.parametrize("resolution", [RESOLUTION, RESOLUTION / 5])
 @pytest.mark.parametrize("far", [0.0, 0.0501, 0.0999, 0.52])
-def test_tested_configurations_are_no_farther_apart_than_the_resolution(far, monkeypatch):
+def test_tested_configurations_are_no_farther_apart_than_the_resolution(
+    far, resolution, monkeypatch
+):
     space, tested, free = space_of(), [], FreeSpace.free
     monkeypatch.setattr(FreeSpace, "free", lambda *args: tested.append(args[1]) or free(*args))
     start = np.array([-0.5, -0.5])
     end = start + np.array([far, far / 3])
-    assert PathPlanner(space, STEP, 0).plan_straight(start, end[None]) is not None
+    planner = PathPlanner(space, STEP, 0, resolution=resolution)
+    assert planner.plan_straight(start, end[None]) is not None
     assert tested[-1][[0, -1]] == pytest.approx(np.array([end, start]))
-    assert np.abs(np.diff(tested[-1], axis=0)).max() <= RESOLUTION + 1e-12
+    assert np.abs(np.diff(tested[-1], axis=0)).max() <= resolution + 1e-12
 
 
 REACH = ReachConfig(num_goals=10)
