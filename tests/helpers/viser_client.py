@@ -112,6 +112,12 @@ class PlainClient:
             self._take(self.websocket.recv(timeout=0.5))
         return identity
 
+    def is_visible(self, control):
+        """Return whether a control is shown."""
+        about = [each for each in self.messages if each.get("uuid") == control]
+        states = [each.get("props", each.get("updates", {})) for each in about]
+        return [state["visible"] for state in states if "visible" in state][-1]
+
     def change(self, control, value=True):
         """Change a control's value, or press a button."""
         self.send({"type": "GuiUpdateMessage", "uuid": control, "updates": {"value": value}})

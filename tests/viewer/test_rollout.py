@@ -272,6 +272,21 @@ def test_a_rollout_opens_with_the_shipped_policy_of_its_task(task, obstacles, po
 
 
 @pytest.mark.parametrize(
+    ("query", "offered"),
+    [("play=push", True), ("play=dial", False), ("play=dial&obstacles=yes", True)],
+)
+def test_obstacles_are_offered_for_tasks_that_have_some(shared_viewer, query, offered):
+    with PlainClient(shared_viewer.port, f"?{query}&robot={CUBE}&policy=zero") as client:
+        checkbox = client.control("Checkbox", "obstacles")
+        client.until(lambda: client.addresses)
+        client.until(lambda: client.is_visible(checkbox) is offered)
+        if "obstacles" in query:
+            client.shows("has no obstacles; expected one without")
+            client.change(checkbox, False)
+            client.until(lambda: not client.is_visible(checkbox))
+
+
+@pytest.mark.parametrize(
     ("query", "reasons"),
     [
         ("?play=rech", ["did you mean"]),

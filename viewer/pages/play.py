@@ -17,6 +17,7 @@ from morphgen.errors import MorphgenError, TaskError, nearest
 from morphgen.rl.baselines import baselines_for
 from morphgen.rl.shipped_policies import is_named, policies_for, zero_shot_policy
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
+from morphgen.tasks.task import TaskConfig
 from morphgen.typing import Array
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import MAX_PLAYED, Address, AddressError
@@ -157,6 +158,8 @@ class PlayPage:
         bind(session, "sim", simulator)
 
         def restart() -> None:
+            # Those that the address asks for in vain can be switched off.
+            obstacles.visible = obstacles.value or has_obstacles(task.value)
             config = RolloutConfig(
                 task.value, robots, policy.value, seed.value, obstacles.value, simulator.value
             )
@@ -172,6 +175,8 @@ class PlayPage:
         def change_task() -> None:
             """Start another task, with its own policy if the current one is for the other."""
             chosen = policy.value
+            if not has_obstacles(task.value):
+                set_value(obstacles, False)
             if is_named(chosen) and chosen not in policies_for(task.value):
                 chosen = default_policy(task.value, obstacles=obstacles.value)
             policy.options = _policies(session.files, task.value, chosen)
@@ -319,6 +324,12 @@ def default_policy(task: str, *, obstacles: bool) -> str:
         return zero_shot_policy(task, "position", obstacles=obstacles).name
     except TaskError:
         return baselines_for(task)[0]
+
+
+def has_obstacles(task: str) -> bool:
+    """Return whether a task can have obstacles."""
+    config: TaskConfig = TASKS[task].config_type()
+    return config.obstacles > 0
 
 
 def complete_address(session: Session) -> Robots:
