@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from morphgen import tasks as tasks
     from morphgen.api.benchmark import similarity, tokens
     from morphgen.api.checks import check, conform, fix
+    from morphgen.api.demonstrations import demos, record, verify
     from morphgen.api.environments import make_env
     from morphgen.api.evaluation import evaluate, play
     from morphgen.api.export import export
@@ -34,6 +35,7 @@ __all__ = [
     "check",
     "compose",
     "conform",
+    "demos",
     "evaluate",
     "export",
     "fit",
@@ -42,11 +44,13 @@ __all__ = [
     "make_env",
     "play",
     "read",
+    "record",
     "sample",
     "similarity",
     "split",
     "tokens",
     "train",
+    "verify",
     "write",
 ]
 
@@ -56,6 +60,7 @@ _MODULES = {
     "check": "morphgen.api.checks",
     "compose": "morphgen.api.robots",
     "conform": "morphgen.api.checks",
+    "demos": "morphgen.api.demonstrations",
     "evaluate": "morphgen.api.evaluation",
     "export": "morphgen.api.export",
     "fit": "morphgen.api.robots",
@@ -64,11 +69,13 @@ _MODULES = {
     "make_env": "morphgen.api.environments",
     "play": "morphgen.api.evaluation",
     "read": "morphgen.api.robots",
+    "record": "morphgen.api.demonstrations",
     "sample": "morphgen.api.robots",
     "similarity": "morphgen.api.benchmark",
     "split": "morphgen.api.splits",
     "tokens": "morphgen.api.benchmark",
     "train": "morphgen.api.training",
+    "verify": "morphgen.api.demonstrations",
     "write": "morphgen.api.robots",
 }
 """Module of each public name."""

@@ -13,6 +13,7 @@ EXTRAS = {
     "fast_simplification": ("fit",),
     "gymnasium": ("tasks", "rl"),
     "imageio": ("tasks", "rl"),
+    "pyarrow": ("demos",),
     "tensorboard": ("rl",),
     "torch": ("tasks", "rl"),
     "urdf_usd_converter": ("usd",),

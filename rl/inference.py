@@ -215,6 +215,13 @@ def read_controller(name: str, task: str) -> ControllerSpec:
     return ControllerSpec(name, task, config, run.interface, learner)
 
 
+def make_controller(spec: ControllerSpec, seed: int) -> Controller:
+    """Return a new controller; its random numbers depend on the seed alone."""
+    if spec.learner is None:
+        return BASELINES[spec.name].make(seed)
+    return PolicyController(Policy(spec.learner, "deterministic", seed))
+
+
 def make_env_and_controller(
     spec: ControllerSpec,
     robot: str | Robot,
@@ -230,23 +237,21 @@ def make_env_and_controller(
     # Evaluations of batches need neither Gymnasium nor the renderer with its video encoder.
     from morphgen.tasks.gym.env import TaskEnv
 
-    interface, policy = vars(spec.interface), None
-    if spec.learner is not None:
-        if kind not in (None, spec.interface.kind):
-            raise TaskError(f"{spec.name}: its actions are {spec.interface.kind}, not {kind}")
-        policy = Policy(spec.learner, "deterministic", seed)
+    interface = vars(spec.interface)
+    if kind not in (None, spec.interface.kind) and spec.learner is not None:
+        raise TaskError(f"{spec.name}: its actions are {spec.interface.kind}, not {kind}")
+    controller = make_controller(spec, seed)
     if kind is not None:
         interface = interface | {"kind": kind}
     options = {"config": spec.task_config, "layouts": "eval", **interface, **options}
     env = TaskEnv(spec.task, robot, **options)
-    if policy is None:
-        return env, BASELINES[spec.name].make(seed)
-    try:
-        policy.require(env.batch.observe())
-    except TaskError:
-        env.close()
-        raise
-    return env, PolicyController(policy)
+    if isinstance(controller, PolicyController):
+        try:
+            controller.policy.require(env.batch.observe())
+        except TaskError:
+            env.close()
+            raise
+    return env, controller
 
 
 def play(
@@ -317,7 +322,7 @@ def run_episodes(batch: TaskBatch, controller: Controller, count: int) -> list[E
     """Return the first ``count`` episodes of every environment, by environment and then by time."""
     batch.reset()
     n = batch.num_envs
-    results = _Results(n, count, batch.device)
+    results = EpisodeResults(n, count, batch.device)
     on_host = is_host(batch.device)
     num_steps = 0
     while True:
@@ -333,7 +338,7 @@ def run_episodes(batch: TaskBatch, controller: Controller, count: int) -> list[E
                 return results.episodes(batch)
 
 
-class _Results:
+class EpisodeResults:
     """Results of the first episodes of every environment, on the device of the batch.
 
     ``finished`` is the number of episodes that ended, ``steps`` that of the control steps of the

@@ -20,6 +20,7 @@ FUNCTIONS = (
     "check",
     "compose",
     "conform",
+    "demos",
     "evaluate",
     "export",
     "fit",
@@ -27,11 +28,13 @@ FUNCTIONS = (
     "make_env",
     "play",
     "read",
+    "record",
     "sample",
     "similarity",
     "split",
     "tokens",
     "train",
+    "verify",
     "write",
 )
 

@@ -23,6 +23,8 @@ from morphgen.grammar.part import part_manifest, write_part
 from morphgen.grammar.request import parse_words
 from morphgen.model.robot import Joint, Robot
 
+RECORDING = "recording.json"
+"""File that every folder of demonstrations has, see ``morphgen.rl.demonstrations``."""
 _PARTS = Path("parts")
 """Folder of the manifests that ``morphgen import --part`` writes by default."""
 
@@ -71,7 +73,13 @@ def write_checked(robot: Robot, args: argparse.Namespace) -> Written:
 
 
 def show(args: argparse.Namespace) -> None:
-    """Print the link tree of one robot."""
+    """Print the link tree of one robot, or what a data set of demonstrations has."""
+    if len(args.words) == 1 and (Path(args.words[0]) / RECORDING).is_file():
+        from morphgen.api.demonstrations import demos
+        from morphgen.cli.demonstrations import print_summary
+
+        print_summary(args, demos(args.words[0]))
+        return
     from morphgen.grammar.robot_source import read_source
 
     sources = opt.sources_of(args)

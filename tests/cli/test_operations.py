@@ -18,7 +18,9 @@ OPERATIONS = {
     "export": ("export", ROBOT, {"root", "json"}),
     "goals": ("goals", ROBOTS, {"json", "wide"}),
     "play": ("play", ROBOT, set()),
+    "record": ("record", ROBOTS, {"json"}),
     "train": ("train", ROBOTS, {*SWITCHES, "observe"}),
+    "verify": ("verify", {}, {"json", "wide"}),
 }
 """For each command the function, the names of its parameters where they differ, and the options
 that are no parameters: they print or write the result, or are switches within ``agent``."""

@@ -1,0 +1,339 @@
+"""Write demonstrations as a LeRobotDataset v3, and read its columns: Parquet and JSON.
+
+LeRobot itself is not used: it needs other versions of torch and NumPy. Arms differ in their joints:
+features of joints are padded with zeros to the largest robot, and ``joint_count`` says how many are
+real. ``robot_index`` is the place of the robot in ``bodies/index.json``. The same episodes give the
+same bytes with the same version of pyarrow.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morphgen.errors import TaskError
+from morphgen.extras import explain_missing_extras
+from morphgen.files import replacing_file, write_cache_file
+from morphgen.formats.data_files import read_json
+from morphgen.formats.zip_files import read_all
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.sim.base import CONTROL_PERIOD
+
+if TYPE_CHECKING:
+    import pyarrow
+
+BODIES = "bodies"  # folder with the bundle of each robot, by its hash
+RECORDING, INDEX, BODY = "recording.json", "bodies/index.json", "body.json"
+FORMAT = 1  # version of what morphgen adds to the format of LeRobot
+Arrays = dict[str, NDArray[Any]]
+
+FPS = round(1 / CONTROL_PERIOD)
+VERSION = "v3.0"
+INFO, STATS, TASKS_FILE = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
+CHUNK = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+DATA_PATH = f"data/{CHUNK}.parquet"
+VIDEO_PATH = f"videos/{{video_key}}/{CHUNK}.mp4"
+EPISODES_FILE = "meta/episodes/chunk-000/file-000.parquet"
+CHUNKS_SIZE, DATA_MB, VIDEO_MB = 1000, 100, 200
+"""Files in a folder, and sizes above which another file begins: LeRobot's defaults."""
+QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
+JOINTS = {
+    "observation.state": "q",
+    "observation.velocity": "qd",
+    "observation.targets": "targets",
+    "action": "action",
+    "normalized_action": "normalized_action",
+    "executed_action": "executed_action",
+}
+"""Features with a number per joint, and their arrays in shards."""
+_POSE = ["x", "y", "z", "qw", "qx", "qy", "qz"]
+_INDICES = ("joint_count", "robot_index", "frame_index", "episode_index", "index", "task_index")
+
+
+def require_pyarrow() -> None:
+    """Require the optional package that reads and writes Parquet."""
+    with explain_missing_extras("demos"):
+        import pyarrow.parquet  # noqa: F401
+
+
+@dataclass(frozen=True)
+class _Feature:
+    """A feature of the format."""
+
+    dtype: str
+    names: list[str] | None = None
+    """Names of its numbers; None for one number."""
+
+    def as_data(self) -> dict[str, Any]:
+        return {"dtype": self.dtype, "shape": [len(self.names or "1")], "names": self.names}
+
+    @property
+    def column(self) -> pyarrow.DataType:
+        """Type of its column."""
+        import pyarrow as pa
+
+        kind = {"float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_()}[self.dtype]
+        return kind if self.names is None else pa.list_(kind, len(self.names))
+
+
+def _features(
+    tasks: Sequence[str], num_joints: int, *, noisy: bool
+) -> tuple[dict[str, _Feature], dict[str, slice]]:
+    """Return the features by name, and where fields of tasks are in the environment's state."""
+    sizes = {field.name: field.size for task in tasks for field in TASKS[task].fields}
+    fields: dict[str, slice] = {}
+    state: list[str] = []
+    for name, size in sizes.items():
+        fields[name] = slice(len(state), len(state) + size)
+        state += [f"{name}_{i}" for i in range(size)]
+    joints = [f"joint_{i}" for i in range(num_joints)]
+    features = {name: _Feature("float32", joints) for name in JOINTS}
+    if not noisy:
+        del features["executed_action"]
+    return {
+        **features,
+        "observation.tool_pose": _Feature("float32", _POSE),
+        "observation.object_pose": _Feature("float32", _POSE),
+        "observation.environment_state": _Feature("float32", state),
+        "next.reward": _Feature("float32"),
+        "next.success": _Feature("bool"),
+        "next.done": _Feature("bool"),
+        "timestamp": _Feature("float32"),
+        **{name: _Feature("int64") for name in _INDICES},
+    }, fields
+
+
+def read_shard(path: Path) -> tuple[list[dict[str, Any]], Arrays]:
+    """Return the episodes of a shard, and the arrays of their steps, one after another."""
+    arrays = read_all(path)
+    return json.loads(str(arrays.pop("episodes"))), arrays
+
+
+def assemble(folder: Path, shards: Mapping[str, Path], tasks: Sequence[str]) -> None:
+    """Write the files of the format from at least one episode; ``meta/info.json`` last.
+
+    Args:
+        folder: The data set, with the robots.
+        shards: Shard of each robot by its hash, in order.
+        tasks: Names of the tasks.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    bodies = [read_json(folder / BODIES / robot / BODY) for robot in shards]
+    dofs = [len(body["joints"]) for body in bodies]
+    settings = read_json(folder / RECORDING)
+    features, fields = _features(tasks, max(dofs), noisy=settings["noise"] > 0)
+    columns = [(name, feature.column) for name, feature in features.items()]
+    schema = pa.schema(columns)
+    rows: list[dict[str, Any]] = []
+    num_frames = file_index = 0
+    writer = None
+    path = folder / DATA_PATH.format(chunk_index=0, file_index=0)
+    for robot_index, (robot, shard) in enumerate(shards.items()):
+        episodes, arrays = read_shard(shard)
+        if not episodes:
+            continue
+        if writer is None:
+            path = folder / DATA_PATH.format(**_place(file_index))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            writer = pq.ParquetWriter(
+                path, schema, compression="zstd", use_dictionary=False, use_byte_stream_split=False
+            )
+        lengths = [episode["length"] for episode in episodes]
+        tables = _columns(arrays, lengths, features, fields)
+        tables["joint_count"] = np.full(sum(lengths), dofs[robot_index])
+        tables["robot_index"] = np.full(sum(lengths), robot_index)
+        tables["index"] = num_frames + np.arange(sum(lengths))
+        tables["episode_index"] = len(rows) + np.repeat(np.arange(len(lengths)), lengths)
+        tables["task_index"] = np.repeat([tasks.index(e["task"]) for e in episodes], lengths)
+        writer.write_table(pa.table([_array(tables[n], t) for n, t in columns], schema=schema))
+        for episode, start in zip(episodes, np.cumsum([0, *lengths]).tolist(), strict=False):
+            length = episode.pop("length")
+            own = {name: values[start : start + length] for name, values in tables.items()}
+            rows.append(
+                {
+                    "episode_index": len(rows),
+                    "tasks": [episode["task"]],
+                    "length": length,
+                    **{f"data/{key}": value for key, value in _place(file_index).items()},
+                    "dataset_from_index": num_frames + start,
+                    "dataset_to_index": num_frames + start + length,
+                    "meta/episodes/chunk_index": 0,
+                    "meta/episodes/file_index": 0,
+                    "robot_hash": robot,
+                    "robot_index": robot_index,
+                    "joint_count": dofs[robot_index],
+                    **episode,
+                    **_statistics(own),
+                }
+            )
+        num_frames += sum(lengths)
+        if path.stat().st_size > DATA_MB * 2**20:
+            writer.close()
+            writer, file_index = None, file_index + 1
+    if not rows:
+        raise TaskError(f"{folder}: no episode ended in success, and nothing else is to be kept")
+    if writer is not None:
+        writer.close()
+    _write_meta(folder, rows, features, tasks)
+    names = ("robot_hash", "name", "category", "derivation", "licences")
+    index = [{name: body[name] for name in names} | {"dof": len(body["joints"])} for body in bodies]
+    _write_json(folder / INDEX, index)
+    info = {
+        "codebase_version": VERSION,
+        "robot_type": "morphgen",
+        "total_episodes": len(rows),
+        "total_frames": num_frames,
+        "total_tasks": len(tasks),
+        "chunks_size": CHUNKS_SIZE,
+        "data_files_size_in_mb": DATA_MB,
+        "video_files_size_in_mb": VIDEO_MB,
+        "fps": FPS,
+        "splits": {"train": f"0:{len(rows)}"},
+        "data_path": DATA_PATH,
+        "video_path": None,
+        "features": {name: feature.as_data() for name, feature in features.items()},
+    }
+    _write_json(folder / INFO, info)
+
+
+def _place(file_index: int) -> dict[str, int]:
+    """Return the folder and number of a file."""
+    return {"chunk_index": file_index // CHUNKS_SIZE, "file_index": file_index % CHUNKS_SIZE}
+
+
+def _columns(
+    arrays: Arrays,
+    lengths: Sequence[int],
+    features: Mapping[str, _Feature],
+    fields: Mapping[str, slice],
+) -> Arrays:
+    """Return the columns of a shard by feature, without those that its place determines."""
+    n = sum(lengths)
+    columns: Arrays = {}
+    for name, source in JOINTS.items():
+        if name in features:
+            values = arrays[source]
+            columns[name] = np.zeros((n, len(features[name].names or ())), np.float32)
+            columns[name][:, : values.shape[1]] = values
+    for name in ("tool_pose", "object_pose"):
+        columns[f"observation.{name}"] = arrays[name]
+    size = len(features["observation.environment_state"].names or ())
+    state = columns["observation.environment_state"] = np.zeros((n, size), np.float32)
+    for name, place in fields.items():
+        if f"field.{name}" in arrays:
+            state[:, place] = arrays[f"field.{name}"]
+    columns |= {f"next.{name}": arrays[name] for name in ("reward", "success", "done")}
+    columns["frame_index"] = np.concatenate([np.arange(length) for length in lengths])
+    columns["timestamp"] = (columns["frame_index"] / FPS).astype(np.float32)
+    return columns
+
+
+def _array(values: NDArray[Any], kind: pyarrow.DataType) -> pyarrow.Array:
+    import pyarrow as pa
+
+    if values.ndim == 1:
+        return pa.array(values, kind)
+    flat = pa.array(np.ascontiguousarray(values).reshape(-1), kind.value_type)
+    return pa.FixedSizeListArray.from_arrays(flat, kind.list_size)
+
+
+def _statistics(columns: Arrays) -> dict[str, list[float] | list[int]]:
+    """Return the statistics of an episode, as columns of its row."""
+    wide = {name: values.reshape(len(values), -1) for name, values in columns.items()}
+    joined = np.concatenate(list(wide.values()), axis=1, dtype=np.float64)
+    quantiles = np.quantile(joined, QUANTILES, axis=0)
+    results = {
+        "min": joined.min(axis=0),
+        "max": joined.max(axis=0),
+        "mean": joined.mean(axis=0),
+        "std": joined.std(axis=0),
+        **{f"q{round(100 * q):02d}": row for q, row in zip(QUANTILES, quantiles, strict=True)},
+    }
+    statistics: dict[str, list[float] | list[int]] = {}
+    start = 0
+    for name, values in wide.items():
+        columns_of = slice(start, start + values.shape[1])
+        for key, row in results.items():
+            statistics[f"stats/{name}/{key}"] = row[columns_of].tolist()
+        statistics[f"stats/{name}/count"] = [len(values)]
+        start += values.shape[1]
+    return statistics
+
+
+def _write_meta(
+    folder: Path,
+    rows: Sequence[Mapping[str, Any]],
+    features: Mapping[str, _Feature],
+    tasks: Sequence[str],
+) -> None:
+    """Write the tasks, the episodes and the statistics of all episodes."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    task_table = pa.table({"task_index": list(range(len(tasks))), "task": list(tasks)})
+    kinds = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}
+    columns = [
+        {"name": k, "field_name": k, "pandas_type": a, "numpy_type": b, "metadata": None}
+        for k, (a, b) in kinds.items()
+    ]
+    # What pandas itself writes, by which it knows that the names of the tasks are an index.
+    index = {"index_columns": ["task"], "column_indexes": [], "columns": columns}
+    task_table = task_table.replace_schema_metadata({"pandas": json.dumps(index)})
+    for name, table in (
+        (TASKS_FILE, task_table),
+        (EPISODES_FILE, pa.Table.from_pylist(list(rows))),
+    ):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        with replacing_file(folder / name) as partial:
+            pq.write_table(table, partial, compression="zstd")
+    stats: dict[str, dict[str, list[float]]] = {}
+    counts = np.array([row["length"] for row in rows], np.float64)[:, None]
+    for name in features:
+        own = {
+            key: np.array([row[f"stats/{name}/{key}"] for row in rows])
+            for key in ("min", "max", "mean", "std", *(f"q{round(100 * q):02d}" for q in QUANTILES))
+        }
+        # As LeRobot does: quantiles are means of those of the episodes.
+        merged = {key: (own[key] * counts).sum(axis=0) / counts.sum() for key in own}
+        spread = own["std"] ** 2 + (own["mean"] - merged["mean"]) ** 2
+        merged["std"] = np.sqrt((spread * counts).sum(axis=0) / counts.sum())
+        merged |= {"min": own["min"].min(axis=0), "max": own["max"].max(axis=0)}
+        stats[name] = {key: values.tolist() for key, values in merged.items()}
+        stats[name]["count"] = [int(counts.sum())]
+    _write_json(folder / STATS, stats)
+
+
+def _write_json(path: Path, data: object) -> None:
+    write_cache_file(path, json.dumps(data, indent=2) + "\n")
+
+
+def read_episodes(folder: Path) -> list[dict[str, Any]]:
+    """Return the rows of the episodes, without their statistics."""
+    import pyarrow.parquet as pq
+
+    path = folder / EPISODES_FILE
+    names = [name for name in pq.read_schema(path).names if not name.startswith("stats/")]
+    rows: list[dict[str, Any]] = pq.read_table(path, columns=names).to_pylist()
+    return rows
+
+
+def read_columns(folder: Path) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield the features of all steps by name: arrays (frames,), or (frames, size)."""
+    import pyarrow.parquet as pq
+
+    table = pq.read_table([str(path) for path in sorted((folder / "data").glob("*/*.parquet"))])
+    for name in table.column_names:
+        column = table[name].combine_chunks()
+        values = column.flatten().to_numpy() if hasattr(column.type, "list_size") else None
+        if values is None:
+            yield name, column.to_numpy(zero_copy_only=False)
+        else:
+            yield name, values.reshape(len(table), -1)

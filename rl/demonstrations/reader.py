@@ -1,0 +1,238 @@
+"""Read demonstrations: steps as tensors, robots, and what a policy observes in each step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from morphgen.encoding.tokens import default_max_links
+from morphgen.errors import FormatError, TaskError
+from morphgen.formats.data_files import read_json
+from morphgen.model.robot import Robot
+from morphgen.rl.demonstrations.lerobot import (
+    BODIES,
+    FORMAT,
+    INDEX,
+    INFO,
+    RECORDING,
+    read_columns,
+    read_episodes,
+    require_pyarrow,
+)
+from morphgen.tasks.actions import ActionKind, encode_actions
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.goals.goal_sets import goals_from_npz
+from morphgen.tasks.observation import Observation, ObservationConfig
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.scenes.env_specs import ground_under, load_robot, task_configs
+from morphgen.tasks.scenes.robot_tables import RobotTables, build_robot_tables
+from morphgen.tasks.sim.base import Scene, Simulation
+from morphgen.tasks.task import EnvSpec
+
+
+@dataclass(frozen=True)
+class RecordedEpisode:
+    """An episode of a data set."""
+
+    index: int
+    robot_index: int
+    robot_hash: str
+    task: str
+    policy: str
+    seed: int
+    """Seed of the environment whose first episode it is; see ``TaskBatch.reset``."""
+    success: bool
+    score: float
+    distance: float
+    first: int
+    """Index of its first step."""
+    length: int
+    """Number of its steps."""
+
+    @property
+    def frames(self) -> range:
+        """Indices of its steps."""
+        return range(self.first, self.first + self.length)
+
+
+class Demonstrations(Dataset[dict[str, torch.Tensor]]):
+    """The steps of a data set, each a dictionary of tensors by feature.
+
+    Attributes:
+        folder: The data set.
+        settings: Content of ``recording.json``.
+        episodes: The episodes, in order.
+        columns: All steps by feature.
+    """
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        """Read all steps into memory.
+
+        Raises:
+            FormatError: If the folder is no complete data set of ``morphgen record``.
+        """
+        require_pyarrow()
+        self.folder = Path(path)
+        if not (self.folder / INFO).is_file():
+            begun = (self.folder / RECORDING).is_file()
+            why = "not finished: run morphgen record again" if begun else f"it has no {INFO}"
+            raise FormatError(f"{self.folder} is no data set: {why}")
+        self.settings: dict[str, Any] = read_json(self.folder / RECORDING)
+        if self.settings.get("format") != FORMAT:
+            raise FormatError(
+                f"{self.folder / RECORDING}: format {self.settings.get('format')!r}; this version "
+                f"reads {FORMAT}"
+            )
+        self.columns = {
+            name: torch.from_numpy(np.array(values)) for name, values in read_columns(self.folder)
+        }
+        self.episodes = tuple(
+            RecordedEpisode(
+                row["episode_index"],
+                first=row["dataset_from_index"],
+                **{name: row[name] for name in _OF_ROW},
+            )
+            for row in read_episodes(self.folder)
+        )
+        self._tables: dict[int, RobotTables] = {}
+
+    def __len__(self) -> int:
+        """Return the number of steps."""
+        return len(self.columns["index"])
+
+    def __getitem__(self, frame: int) -> dict[str, torch.Tensor]:
+        """Return the features of a step."""
+        return {name: values[frame] for name, values in self.columns.items()}
+
+    def __getitems__(self, frames: Sequence[int]) -> list[dict[str, torch.Tensor]]:
+        """Return the features of several steps, as ``DataLoader`` asks for them."""
+        return [self[frame] for frame in frames]
+
+    @cached_property
+    def robot_hashes(self) -> tuple[str, ...]:
+        """Hashes of the robots, which ``robot_index`` refers to."""
+        return tuple(body["robot_hash"] for body in read_json(self.folder / INDEX))
+
+    @cached_property
+    def robots(self) -> tuple[Robot, ...]:
+        """The robots, which ``robot_index`` refers to, with primitives as collision shapes."""
+        return tuple(load_robot(self.folder / BODIES / each) for each in self.robot_hashes)
+
+    @cached_property
+    def specs(self) -> Mapping[tuple[int, str], EnvSpec]:
+        """Environments by robot index and task, with the goals of the data set."""
+        configs = {each.task: each for each in task_configs(self.settings["constants"])}
+        keys = dict.fromkeys((episode.robot_index, episode.task) for episode in self.episodes)
+        specs = {}
+        for robot_index, task in keys:
+            robot, kind = self.robots[robot_index], TASKS[task]
+            path = self.folder / BODIES / self.robot_hashes[robot_index] / "goals" / f"{task}.npz"
+            goals = goals_from_npz(path.read_bytes(), task, path)
+            scene = kind.scene(robot, goals, ground_under(robot))
+            specs[robot_index, task] = EnvSpec(robot, task, scene, goals, configs[task])
+        return specs
+
+    def observe(
+        self,
+        frames: Sequence[int] | torch.Tensor,
+        observe: ObservationConfig | None = None,
+        *,
+        kind: ActionKind = "continuous",
+        max_links: int | None = None,
+    ) -> tuple[Observation, torch.Tensor]:
+        """Return what a policy observes in n steps, and the actions that it should return.
+
+        Observations are computed from the recorded states by the code that computes them in
+        environments, and equal those. A call takes milliseconds besides the time of each step:
+        ask for thousands of steps at once.
+
+        Args:
+            frames: Indices of the steps.
+            observe: Optional entries of observations.
+            kind: Kind of the actions.
+            max_links: Number of links that observations are padded to; by default 23, or that of
+                the largest robot.
+
+        Returns:
+            The observations, and the actions of the policy that was recorded, without noise,
+            shape (n, L).
+
+        Raises:
+            TaskError: If observations have the channel ``ik``, which depends on earlier steps.
+        """
+        if observe is not None and observe.ik:
+            raise TaskError(
+                "observation channel 'ik' depends on earlier steps, which data sets do not keep"
+            )
+        rows = torch.as_tensor(frames)
+        columns = {name: self.columns[name][rows] for name in _OBSERVED}
+        episodes = [self.episodes[i] for i in columns["episode_index"].tolist()]
+        places = {key: i for i, key in enumerate(self.specs)}
+        index = [places[episode.robot_index, episode.task] for episode in episodes]
+        specs = [*self.specs.values()]
+        links = max_links or default_max_links(len(robot.links) for robot in self.robots)
+        if links not in self._tables:
+            robots = [spec.robot for spec in specs]
+            self._tables[links] = build_robot_tables(robots, max_links=links)
+        batch = TaskBatch(
+            self._tables[links],
+            specs,
+            index,
+            _RecordedStates([specs[i].scene for i in index], columns),
+            kind=kind,
+            observe=observe,
+        )
+        batch.reset(seed=[episode.seed for episode in episodes])
+        batch.targets.copy_(columns["observation.targets"])
+        executed = self.columns.get("executed_action", self.columns["normalized_action"])
+        before = at_links(batch, executed[(rows - 1).clamp(min=0)])
+        starts = (columns["frame_index"] == 0)[:, None]
+        batch.previous_action.copy_(before.masked_fill(starts, 0))
+        action = at_links(batch, columns["normalized_action"])
+        return batch.observe(), encode_actions(action, kind)
+
+
+_OBSERVED = (
+    *("observation.state", "observation.velocity", "observation.targets"),
+    *("observation.object_pose", "normalized_action", "episode_index", "frame_index"),
+)
+"""Features that observations and labels are computed from."""
+_OF_ROW = (
+    *("robot_index", "robot_hash", "task", "policy", "seed", "success", "score", "distance"),
+    "length",
+)
+
+
+def at_links(batch: TaskBatch, action: torch.Tensor) -> torch.Tensor:
+    """Return actions of independent joints (n, J) by link, shape (n, L)."""
+    return batch.observation.link_joints(action).where(batch.action_mask, 0.0)
+
+
+class _RecordedStates(Simulation):
+    """States that were recorded, in place of a simulation: observations are computed from them."""
+
+    def __init__(self, scenes: Sequence[Scene], columns: dict[str, torch.Tensor]) -> None:
+        super().__init__(scenes, torch.device("cpu"))
+        self.q, self.qd = columns["observation.state"], columns["observation.velocity"]
+        self.object_pose = columns["observation.object_pose"]
+
+    @property
+    def object_velocity(self) -> torch.Tensor:
+        raise NotImplementedError("recorded states have no velocities of objects")
+
+    def faults(self) -> dict[int, str]:
+        return {}
+
+    def _reset(self, *_: object) -> None:
+        pass  # the states are those that were recorded
+
+    def _step(self, targets: torch.Tensor) -> torch.Tensor:
+        raise NotImplementedError("recorded states cannot be stepped")

@@ -1,0 +1,467 @@
+"""Record episodes of a policy: robot by robot, in any number of processes, with resuming.
+
+Each robot is a unit of work. Its bundle is written first, and the episodes are those of the robot
+that is read from the bundle, so that whoever has the folder can simulate them again. The episodes
+of a robot wait in a shard; when all are there, ``lerobot.assemble`` writes the data set from them.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from morphgen.encoding.tokens import tokens, tokens_npz
+from morphgen.errors import MorphgenError, TaskError
+from morphgen.files import write_atomic
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.formats.bundle import write_bundle
+from morphgen.formats.data_files import read_json
+from morphgen.formats.files import locked_folder, require_writable_folder, writing
+from morphgen.grammar.library import Library, default_library
+from morphgen.grammar.robot_source import is_robot_file, resolve_robot
+from morphgen.model.kinematics import joint_limits
+from morphgen.model.kinematics_torch import frame_pose, quaternion_from_matrix
+from morphgen.model.robot import TOOL, Robot
+from morphgen.processes import one_torch_thread, parallel_map, ray_cluster, require_ray
+from morphgen.progress import report, stage
+from morphgen.rl.baselines import BASELINES, Controller, baselines_for
+from morphgen.rl.demonstrations.lerobot import (
+    BODIES,
+    BODY,
+    FORMAT,
+    INFO,
+    RECORDING,
+    Arrays,
+    assemble,
+    require_pyarrow,
+)
+from morphgen.rl.inference import EpisodeResults, make_controller, read_controller
+from morphgen.rl.runs.robot_source import (
+    GrammarSource,
+    OneRobot,
+    Source,
+    SplitSource,
+    draw,
+    identity,
+    members,
+)
+from morphgen.splits.split import Member, compose_member
+from morphgen.tasks.actions import encode_actions
+from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.goals.goal_sets import set_npz
+from morphgen.tasks.goals.split_goals import read_goals, shipped_goal_set
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
+from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot
+from morphgen.tasks.scenes.make import batch_from_specs
+from morphgen.tasks.task import EnvSpec, GoalSet
+
+PLANNER = "scripted"
+"""Policy that is the best baseline of each task: ``ik`` for reach, ``scripted`` for others."""
+SHARDS, TOKENS_FILE = "shards", "tokens.npz"
+_SEED_OFFSET = 0xDE_305
+"""Mixed into the seeds of episodes, which thus differ from those of training and evaluation."""
+
+
+@dataclass(frozen=True)
+class RecordingConfig:
+    """All that determines the episodes of a data set."""
+
+    sources: tuple[Source, ...]
+    """Robots with their tasks; those of a split have a task each."""
+    policy: str = PLANNER
+    """A baseline, a shipped policy, a checkpoint, or ``PLANNER``."""
+    episodes: int = 20
+    """Number of episodes of each robot at each of its tasks."""
+    seed: int = 0
+    """Seed of the episodes, of the policy and of the noise."""
+    noise: float = 0.0
+    """Standard deviation of the noise on normalized actions; labels have none."""
+    hold: int = 25
+    """Control steps in success, one after another, that end an episode: reach has no other end
+    before its time limit, and a robot that stays at its goal shows little more."""
+    only_success: bool = False
+    """Whether to keep only the episodes that end in success."""
+    sim: str = DEFAULT_SIMULATOR
+    goals: GoalConfig = field(default_factory=GoalConfig)
+
+    def policy_for(self, task: str) -> str:
+        """Return the name of the policy at a task."""
+        return baselines_for(task)[0] if self.policy == PLANNER else self.policy
+
+    def as_data(self, tasks: Sequence[str]) -> dict[str, Any]:
+        """Return the entries of ``recording.json``; they contain no folder of this machine."""
+        robots = []
+        for source in self.sources:
+            entries = identity(source)
+            name = Path(source.name).name if is_robot_file(source.name) else source.name
+            entries |= {"name": name}
+            robots.append({k: v for k, v in entries.items() if k not in ("library", "goal_dir")})
+        return {
+            "format": FORMAT,
+            "robots": robots,
+            "policy": {task: _named(self.policy_for(task)) for task in tasks},
+            **{key: getattr(self, key) for key in _KEYS},
+            "constants": self.goals.as_data(tasks),
+        }
+
+
+_KEYS = ("episodes", "seed", "noise", "hold", "only_success", "sim")
+
+
+def _named(policy: str) -> str:
+    return policy if policy in BASELINES or not Path(policy).exists() else Path(policy).name
+
+
+@dataclass(frozen=True)
+class RecordedRobot:
+    """A robot to record at some tasks: a unit of work."""
+
+    robot_hash: str
+    name: str
+    category: str  # grammar, ``composed``, or empty for a robot that is named by its file
+    source: Source
+    member: Member | None
+    """Member of a split or of the drawn robots; None if the source is one robot."""
+    tasks: tuple[tuple[str, bool], ...]
+    """Names of its tasks, and whether there are obstacles."""
+
+
+def robots_of(config: RecordingConfig, jobs: int = 1) -> tuple[RecordedRobot, ...]:
+    """Return the robots of all sources in order; robots with the same hash are one."""
+    units: dict[str, RecordedRobot] = {}
+    for source in config.sources:
+        for member, unit in _units(source, config, jobs):
+            task = (member.task, member.obstacles) if member else unit.tasks[0]
+            known = units.setdefault(unit.robot_hash, replace(unit, tasks=()))
+            if task not in known.tasks:
+                units[unit.robot_hash] = replace(known, tasks=(*known.tasks, task))
+    return tuple(units.values())
+
+
+def _units(
+    source: Source, config: RecordingConfig, jobs: int
+) -> Iterator[tuple[Member | None, RecordedRobot]]:
+    if isinstance(source, OneRobot):
+        task = source.task, source.obstacles
+        yield None, RecordedRobot(source.robot_hash, source.name, "", source, None, (task,))
+        return
+    if isinstance(source, GrammarSource):
+        with stage(f"drawing {source.name} for {source.task}"):
+            of_source = draw(source, config.goals, jobs=jobs).members
+    else:
+        of_source = members(source)
+        source = replace(source, split="")  # the text of all robots, for which each has its own
+    for member in of_source:
+        yield (
+            member,
+            RecordedRobot(member.robot_hash, member.name, member.category, source, member, ()),
+        )
+
+
+def record(folder: Path, config: RecordingConfig, *, jobs: int = 1, ray: str | None = None) -> Path:
+    """Record the episodes of all robots into a data set, and return its folder.
+
+    An interrupted call continues, and gives the same bytes.
+
+    Args:
+        folder: The data set: a new folder, or one that the same config was recorded to.
+        config: Robots, tasks, policy and seed.
+        jobs: Number of processes.
+        ray: Address of a Ray cluster, or an empty text for a local one; None for processes.
+    """
+    require_pyarrow()
+    require_writable_folder(folder)
+    robots = robots_of(config, jobs)
+    tasks = tuple(dict.fromkeys(task for robot in robots for task, _ in robot.tasks))
+    for task in tasks:
+        read_controller(config.policy_for(task), task)  # raises if the policy is not for the task
+    _begin(folder, config.as_data(tasks))
+    if (folder / INFO).is_file():
+        return folder
+    with locked_folder(folder):
+        missing = [robot for robot in robots if not _shard(folder, robot).is_file()]
+        work = partial(record_robot, folder.resolve(), replace(config, sources=()))
+        with stage("recording"):
+            run = (
+                parallel_map(work, missing, jobs, 1) if ray is None else _on_ray(ray, work, missing)
+            )
+            for _ in run:
+                pass
+        try:
+            assemble(folder, {r.robot_hash: _shard(folder, r) for r in robots}, tasks)
+        except TaskError:  # no episode succeeded: leave nothing behind
+            for name in (BODIES, SHARDS):
+                shutil.rmtree(folder / name)
+            (folder / RECORDING).unlink()
+            raise
+        shutil.rmtree(folder / SHARDS)
+    return folder
+
+
+def _shard(folder: Path, robot: RecordedRobot) -> Path:
+    return folder / SHARDS / f"{robot.robot_hash}.npz"
+
+
+def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Write the settings into a new folder, or require that an old one has the same."""
+    path = folder / RECORDING
+    text = json.dumps(settings, indent=2) + "\n"
+    if not path.is_file():
+        if folder.is_dir() and any(folder.iterdir()):
+            raise TaskError(f"{folder} exists and is no data set (no {RECORDING}); name another")
+        with writing(f"to {folder}", TaskError):
+            (folder / SHARDS).mkdir(parents=True)
+            write_atomic(path, text)
+        return
+    stored = read_json(path)
+    for key, value in json.loads(text).items():
+        if not isinstance(stored, dict) or stored.get(key) != value:
+            raise TaskError(
+                f"{folder} holds other demonstrations: their {key} differ; expected "
+                f"{json.dumps(value)[:200]}; name another folder"
+            )
+
+
+def _on_ray(
+    address: str, work: Callable[[RecordedRobot], int], robots: Sequence[RecordedRobot]
+) -> Iterator[int]:
+    """Record robots as tasks of a Ray cluster, whose machines share the folder."""
+    ray = require_ray()
+    try:
+        with ray_cluster(address or None):
+            remote = ray.remote(num_cpus=1)(work)
+            running = [remote.remote(robot) for robot in robots]
+            while running:
+                (done, *_), running = ray.wait(running)
+                yield ray.get(done)
+                report(len(robots) - len(running), len(robots))
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause if isinstance(error.cause, MorphgenError) else error from None
+    except ray.exceptions.RayError as error:
+        raise MorphgenError(
+            f"a Ray worker died ({error}); finished robots are kept: run again"
+        ) from error
+
+
+def record_robot(folder: Path, config: RecordingConfig, unit: RecordedRobot) -> int:
+    """Write a robot's bundle and the shard of its episodes; return their number."""
+    library = default_library(tuple(map(Path, unit.source.library)))
+    body = folder / BODIES / unit.robot_hash
+    if unit.member is None:
+        robot = resolve_robot(unit.source.name, library)
+    else:
+        robot = compose_member(unit.member, library)
+    write_bundle(robot, body, picture=False, edits_kept=False)
+    robot = load_robot(body)  # which the episodes are of
+    arrays: dict[str, list[NDArray[Any]]] = {}
+    episodes: list[dict[str, Any]] = []
+    goals: dict[str, dict[str, Any]] = {}
+    fields = {f"field.{f.name}": f.size for task, _ in unit.tasks for f in TASKS[task].fields}
+    (body / "goals").mkdir()
+    for task, obstacles in unit.tasks:
+        shipped = _shipped(unit)
+        spec = env_spec(
+            robot,
+            task,
+            replace(config.goals, seed=unit.source.goal_seed),
+            obstacles=obstacles,
+            shipped=shipped,
+        )
+        (body / "goals" / f"{task}.npz").write_bytes(set_npz(spec.goals))
+        goals[task] = {"key": spec.goals.key, "obstacles": obstacles}
+        for episode, frames in _record_task(spec, config, unit.robot_hash):
+            episodes.append(episode)
+            others = {k: np.zeros((episode["length"], n), np.float32) for k, n in fields.items()}
+            for name, values in (others | frames).items():
+                arrays.setdefault(name, []).append(values)
+    _write_body(body, robot, unit, goals, library)
+    joined = {name: np.concatenate(values) for name, values in arrays.items()}
+    joined["episodes"] = np.array(json.dumps(episodes))
+    content = io.BytesIO()
+    np.savez_compressed(content, **joined)  # type: ignore[arg-type]  # they are not allow_pickle
+    write_atomic(_shard(folder, unit), content.getvalue())
+    return len(episodes)
+
+
+def _shipped(unit: RecordedRobot) -> GoalSet | None:
+    source = unit.source
+    if unit.member is None or not isinstance(source, SplitSource) or not source.goal_dir:
+        return None
+    return shipped_goal_set(
+        read_goals(source.goal_dir, source.side), unit.member.name, source.goal_dir
+    )
+
+
+def _write_body(
+    body: Path,
+    robot: Robot,
+    unit: RecordedRobot,
+    goals: Mapping[str, Mapping[str, Any]],
+    library: Library,
+) -> None:
+    """Write tokens and a summary of a robot beside its bundle."""
+    names = [link.name for link in robot.links]
+    shapes = token_shapes(robot, library.folders)
+    array = tokens(robot, shapes, max_links=max(len(names), 2))
+    (body / TOKENS_FILE).write_bytes(tokens_npz(array, names, robot.name, max(len(names), 2)))
+    tool = robot.frame(TOOL)
+    joints = []
+    for k, (lower, upper) in zip(robot.independent_joints, joint_limits(robot), strict=True):
+        joint = robot.joints[k]
+        joints.append(
+            {
+                "name": joint.name,
+                "kind": joint.kind,
+                "lower": lower,
+                "upper": upper,
+                "velocity": joint.velocity,
+                "effort": joint.effort,
+            }
+        )
+    parts = robot.provenance.get("parts", [])
+    assert isinstance(parts, list)
+    licences = sorted({part.get("licence", "") for part in parts} - {""})
+    data = {
+        "robot_hash": unit.robot_hash,
+        "name": robot.name,
+        "category": unit.category,
+        "derivation": robot.provenance.get("derivation", ""),
+        "licences": licences,
+        "joints": joints,
+        "tool": {"link": tool.link, **asdict(tool.T_link_frame)},
+        "goals": goals,
+    }
+    (body / BODY).write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
+
+
+def episode_seeds(seed: int, robot: str, task: str, count: int) -> list[int]:
+    """Return the seed of each episode of a robot, by its hash, at a task."""
+    words = [_SEED_OFFSET, seed, int(robot, 16), *task.encode()]
+    states = np.random.SeedSequence(words).generate_state(count, np.uint64)
+    return [int(state >> 1) for state in states]  # Parquet has no unsigned column in LeRobot
+
+
+def _record_task(
+    spec: EnvSpec, config: RecordingConfig, robot: str
+) -> Iterator[tuple[dict[str, Any], Arrays]]:
+    """Yield the episodes of a robot at a task, each with the arrays of its steps."""
+    policy = config.policy_for(spec.task)
+    controller_spec = read_controller(policy, spec.task)
+    seeds = episode_seeds(config.seed, robot, spec.task, config.episodes)
+    # A planner takes seconds for a plan, and would plan for every environment whose episode ended
+    # before the longest; the networks of a policy take long for each of their calls.
+    num_envs = (
+        1 if TASKS[spec.task].moves_object and controller_spec.learner is None else len(seeds)
+    )
+    simulator = SIMULATORS[config.sim]
+    batch = batch_from_specs(
+        [spec],
+        num_envs,
+        sim=config.sim,
+        device=simulator.devices[0],
+        workers=1,
+        **vars(controller_spec.interface),
+    )
+    with closing(batch):
+        controller = make_controller(controller_spec, config.seed)
+        generator = torch.Generator().manual_seed(seeds[0])
+        for first in range(0, len(seeds), num_envs):
+            own = seeds[first : first + num_envs]
+            for seed, episode, arrays in _episodes(batch, controller, own, config, generator):
+                if not episode.diverged and (episode.success or not config.only_success):
+                    facts = {"task": spec.task, "policy": _named(policy), "seed": seed}
+                    facts |= {k: getattr(episode, k) for k in ("success", "score", "distance")}
+                    yield {**facts, "length": episode.steps}, arrays
+
+
+@one_torch_thread()
+def _run(
+    batch: TaskBatch,
+    controller: Controller,
+    seeds: Sequence[int],
+    config: RecordingConfig,
+    generator: torch.Generator,
+) -> tuple[EpisodeResults, list[dict[str, torch.Tensor]]]:
+    """Run an episode of every environment; return the results and all steps, (n, ...) each."""
+    noise, hold = config.noise, config.hold
+    batch.reset(seed=seeds)
+    results = EpisodeResults(batch.num_envs, 1, batch.device)
+    successes, steps = torch.zeros_like(batch.episode_step), []
+    while not bool((results.finished > 0).all()):
+        values = step_state(batch)
+        mask = batch.action_mask
+        action = batch.decode_actions(controller.act(batch), mask.shape).where(mask, 0.0)
+        executed = action
+        if noise:
+            random = torch.randn(mask.shape, generator=generator).to(action)
+            executed = (action + noise * random).clamp(-1, 1).where(mask, 0.0)
+        given = encode_actions(executed, batch.action_kind)
+        executed = batch.decode_actions(given, mask.shape)
+        values["normalized_action"] = at_joints(batch, action)
+        values["action"] = commanded_targets(batch, values["normalized_action"])
+        if noise:
+            values["executed_action"] = at_joints(batch, executed)
+        step = batch.step(given)
+        successes = torch.where(step.success, successes + 1, 0)
+        is_held = (successes >= hold) & ~step.terminated
+        step = replace(step, truncated=step.truncated | is_held)
+        results.add(step)
+        values |= {"reward": step.reward, "success": step.success}
+        values["done"] = step.terminated | step.truncated
+        steps.append(values)
+    return results, steps
+
+
+def _episodes(
+    batch: TaskBatch,
+    controller: Controller,
+    seeds: Sequence[int],
+    config: RecordingConfig,
+    generator: torch.Generator,
+) -> Iterator[tuple[int, Any, Arrays]]:
+    """Yield the seed and result of an episode of each environment, and its arrays by step."""
+    results, steps = _run(batch, controller, seeds, config, generator)
+    stacked = {k: torch.stack([step[k] for step in steps]).cpu().numpy() for k in steps[0]}
+    for seed, episode in zip(seeds, results.episodes(batch), strict=True):
+        yield seed, episode, {k: v[: episode.steps, episode.env] for k, v in stacked.items()}
+
+
+def step_state(batch: TaskBatch) -> dict[str, torch.Tensor]:
+    """Return all that the observations of a batch depend on, and what data sets add, (n, ...)."""
+    simulation, q = batch.simulation, batch.q
+    T_root_tool = frame_pose(batch.robot_tables.tool_chain, batch.env_robot_index, q)
+    rotation = quaternion_from_matrix(T_root_tool[:, :3, :3])
+    names = [field.name for task in {s.task for s in batch.specs} for field in TASKS[task].fields]
+    fields = batch.groups.fields(simulation.object_pose)
+    return {
+        "q": q,
+        "qd": simulation.qd.clone(),
+        "targets": batch.targets.clone(),
+        "tool_pose": torch.cat([T_root_tool[:, :3, 3], rotation], dim=1),
+        "object_pose": simulation.object_pose.clone(),
+        **{f"field.{name}": fields[name] for name in names},
+    }
+
+
+def commanded_targets(batch: TaskBatch, action: torch.Tensor) -> torch.Tensor:
+    """Return the joint targets that normalized actions of joints (n, J) command, [rad or m]."""
+    tables, index = batch.robot_tables, batch.env_robot_index
+    targets: torch.Tensor = batch.targets + action * tables.max_step[index]
+    return targets.clamp(tables.lower[index], tables.upper[index])
+
+
+def at_joints(batch: TaskBatch, action: torch.Tensor) -> torch.Tensor:
+    """Return actions of links (n, L) by independent joint, shape (n, J)."""
+    link = batch.robot_tables.link_of_joint[batch.env_robot_index]
+    return torch.gather(action, 1, link)

@@ -1,0 +1,246 @@
+"""Demonstrations: recording, the files, what readers see, and replay."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+import morphgen
+from morphgen.encoding.robot_hash import robot_hash
+from morphgen.errors import FormatError, MorphgenError, TaskError
+from morphgen.formats.bundle import read_bundle
+from morphgen.formats.files import folder_hashes
+from morphgen.rl.baselines import BASELINES
+from morphgen.rl.demonstrations import recording
+from morphgen.rl.demonstrations.lerobot import BODIES, INFO, read_episodes
+from morphgen.rl.demonstrations.recording import RecordingConfig, record
+from morphgen.rl.inference import run_episodes
+from morphgen.rl.runs.robot_source import drawn_source
+from morphgen.tasks.observation import ObservationConfig
+from morphgen.tasks.scenes.make import batch_from_specs
+
+pq = pytest.importorskip("pyarrow.parquet")
+
+CHANNELS = ObservationConfig(
+    velocity=True,
+    previous_action=True,
+    tool=True,
+    lag=True,
+    joint=True,
+    poses=True,
+    jacobian=True,
+    dls=True,
+    tree=True,
+    points=8,
+)
+
+
+def config(tasks=("reach",), grammars="prims:1,planar_arm:1", **changes):
+    sources = tuple(drawn_source(grammars, task) for task in tasks)
+    return RecordingConfig(sources, episodes=2, **changes)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two robots at reach, with noise."""
+    return record(tmp_path_factory.mktemp("demos") / "demos", config(noise=0.2))
+
+
+@pytest.fixture
+def demos(folder):
+    return morphgen.demos(folder)
+
+
+def test_the_folder_is_a_lerobot_data_set(folder):
+    info = json.loads((folder / INFO).read_text())
+    table = pq.read_table(folder / info["data_path"].format(chunk_index=0, file_index=0))
+    assert info["codebase_version"] == "v3.0"
+    assert (info["total_episodes"], info["total_frames"]) == (4, len(table))
+    assert list(info["features"]) == table.column_names
+    for name, feature in info["features"].items():
+        size = getattr(table.schema.field(name).type, "list_size", 1)
+        assert [size] == feature["shape"], name
+    assert table["index"].to_pylist() == list(range(len(table)))
+    rows = read_episodes(folder)
+    assert [row["episode_index"] for row in rows] == [0, 1, 2, 3]
+    assert sum(row["length"] for row in rows) == len(table)
+    assert rows[-1]["dataset_to_index"] == len(table)
+    stats = json.loads((folder / "meta/stats.json").read_text())
+    state = np.array(table["observation.state"].to_pylist())
+    np.testing.assert_allclose(stats["observation.state"]["mean"], state.mean(axis=0), atol=1e-9)
+    np.testing.assert_allclose(stats["observation.state"]["std"], state.std(axis=0), atol=1e-9)
+    tasks = pq.read_table(folder / "meta/tasks.parquet")
+    assert tasks.to_pydict() == {"task_index": [0], "task": ["reach"]}
+
+
+def test_every_episode_has_its_body(folder, demos):
+    for episode in demos.episodes:
+        body = folder / BODIES / episode.robot_hash
+        facts = json.loads((body / "body.json").read_text())
+        assert robot_hash(read_bundle(body)) == facts["robot_hash"] == episode.robot_hash
+        assert facts["licences"] == ["MIT"]
+        assert len(facts["joints"]) == demos.robots[episode.robot_index].dof
+        assert facts["derivation"]
+        for name in ("robot.urdf", "robot.xml", "tokens.npz", "goals/reach.npz"):
+            assert (body / name).is_file()
+
+
+def test_padding_is_zero_and_counted(demos):
+    dofs = [robot.dof for robot in demos.robots]
+    assert len(set(dofs)) == 2
+    state, count = demos.columns["observation.state"], demos.columns["joint_count"]
+    assert state.shape[1] == max(dofs)
+    padding = torch.arange(max(dofs)) >= count[:, None]
+    assert padding.any()
+    for name in ("observation.state", "action", "normalized_action", "executed_action"):
+        assert not demos.columns[name][padding].any()
+
+
+@pytest.mark.parametrize("kind", ["continuous", "discrete"])
+def test_observations_equal_those_of_the_environment(demos, kind):
+    episode = demos.episodes[-1]
+    spec = demos.specs[episode.robot_index, episode.task]
+    batch = batch_from_specs([spec], 1, observe=CHANNELS, workers=1)
+    observed, labels = demos.observe(episode.frames, CHANNELS, kind=kind)
+    executed, _ = demos.columns["executed_action"], batch.reset(seed=[episode.seed])
+    for t, frame in enumerate(episode.frames):
+        for name, values in batch.observe().items():
+            if name not in ("joints", "joint_parents", "joint_relations"):  # padded to more joints
+                assert torch.equal(observed[name][t], values[0]), (name, t)
+        action = batch.observation.link_joints(executed[frame, None, : spec.robot.dof])
+        batch.step(action.where(batch.action_mask, 0.0))
+    batch.close()
+    assert labels.shape == observed["actions"].shape
+    assert labels.is_floating_point() == (kind == "continuous")
+
+
+def test_the_label_is_the_planners_own_action_and_not_the_noisy_one(demos):
+    label, executed = demos.columns["normalized_action"], demos.columns["executed_action"]
+    assert (label - executed).abs().max() > 0.1
+    targets, action = demos.columns["observation.targets"], demos.columns["action"]
+    rows = demos.columns["robot_index"] == 0
+    from morphgen.tasks.scenes.robot_tables import build_robot_tables
+
+    tables = build_robot_tables(demos.robots[:1])
+    dof = demos.robots[0].dof
+    wanted = targets[rows, :dof] + label[rows, :dof] * tables.max_step[0]
+    assert torch.equal(action[rows, :dof], wanted.clamp(tables.lower[0], tables.upper[0]))
+
+
+def test_items_are_steps_that_a_data_loader_collates(demos):
+    loader = torch.utils.data.DataLoader(demos, batch_size=8, shuffle=True)
+    batch = next(iter(loader))
+    assert batch["action"].shape == (8, demos.columns["action"].shape[1])
+    assert len(loader.dataset) == sum(episode.length for episode in demos.episodes)
+
+
+def test_the_channel_ik_is_refused(demos):
+    with pytest.raises(TaskError, match="'ik' depends on earlier steps"):
+        demos.observe([0], ObservationConfig(ik=True))
+
+
+def test_an_interrupted_recording_continues_to_the_same_bytes(folder, tmp_path, monkeypatch):
+    copy, once = tmp_path / "demos", config(noise=0.2)
+    real = recording.record_robot
+
+    def stop_at_the_second(*arguments):
+        if any((copy / "shards").glob("*.npz")):
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    monkeypatch.setattr(recording, "record_robot", stop_at_the_second)
+    with pytest.raises(KeyboardInterrupt):
+        record(copy, once)
+    assert len(list((copy / "shards").glob("*.npz"))) == 1
+    with pytest.raises(FormatError, match="not finished"):
+        morphgen.demos(copy)
+    monkeypatch.undo()
+    record(copy, once)
+    assert folder_hashes(copy) == folder_hashes(folder)
+
+
+@pytest.mark.slow
+def test_processes_give_the_same_bytes(folder, tmp_path):
+    record(tmp_path / "demos", config(noise=0.2), jobs=2)
+    assert folder_hashes(tmp_path / "demos") == folder_hashes(folder)
+
+
+def test_a_folder_of_something_else_is_refused(folder, tmp_path):
+    with pytest.raises(TaskError, match="their seed differ"):
+        record(folder, config(noise=0.2, seed=1))
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(TaskError, match=r"no recording\.json"):
+        record(tmp_path, config())
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ({"drawn": "prims:1", "tasks": ["reach"], "policy": "jacobian", "noise": -1}, "noise"),
+        ({"drawn": "prims:1", "tasks": ["push"], "policy": "ik"}, "is for reach, not for push"),
+        ({"drawn": "prims:1", "tasks": ["fly"]}, "unknown task 'fly'"),
+        ({"drawn": "prims:1", "robots": "prims"}, "either robots"),
+        ({}, "either robots"),
+        ({"drawn": "prims"}, "is not a grammar and a number"),
+        ({"drawn": "prims:1", "sim": "best"}, "unknown simulator 'best'"),
+    ],
+)
+def test_invalid_arguments_write_nothing(tmp_path, arguments, match):
+    with pytest.raises(MorphgenError, match=match):
+        morphgen.record(**arguments, out=tmp_path / "demos")
+    assert not (tmp_path / "demos").exists()
+
+
+def test_only_successes_are_kept_if_asked_for(tmp_path):
+    folder = record(tmp_path / "demos", config(("reach",), "prims:2", policy="jacobian"))
+    every = morphgen.demos(folder).episodes
+    folder = record(
+        tmp_path / "successes", config(("reach",), "prims:2", policy="jacobian", only_success=True)
+    )
+    kept = morphgen.demos(folder).episodes
+    assert [each.seed for each in kept] == [each.seed for each in every if each.success]
+
+
+def test_a_recording_without_success_leaves_nothing(tmp_path):
+    with pytest.raises(TaskError, match="no episode ended in success"):
+        record(tmp_path / "demos", config(policy="zero", only_success=True))
+    assert [*tmp_path.glob("demos/*")] == []
+
+
+def test_recorded_results_are_those_of_the_policy(demos):
+    """Without the end after successes they are the episodes of an evaluation."""
+    spec = demos.specs[0, "reach"]
+    batch = batch_from_specs([spec], 2, workers=1)
+    scores = run_episodes(batch, BASELINES["ik"].make(0), 1)
+    assert all(each.success for each in scores)
+    assert all(episode.success for episode in demos.episodes)
+    for episode in demos.episodes:
+        success = demos.columns["next.success"][list(episode.frames)]
+        assert success[-25:].all()
+        assert demos.columns["next.done"][episode.frames[-1]]
+        assert not demos.columns["next.done"][list(episode.frames[:-1])].any()
+
+
+def test_replays_agree_and_tell_changes(folder, tmp_path):
+    for each in morphgen.verify(folder, episodes=2):
+        assert each.agrees
+        assert each.joint_error == each.object_error == each.reward_error == 0
+    copy = tmp_path / "demos"
+    shutil.copytree(folder, copy)
+    urdf = next(copy.glob("bodies/*/robot.urdf"))
+    urdf.write_text(urdf.read_text().replace("<robot", "<!-- mine --><robot", 1))
+    replays = morphgen.verify(copy, episodes=4)
+    assert sorted({bool(each.faults) for each in replays}) == [False, True]
+
+
+@pytest.mark.slow
+def test_tasks_with_objects_share_a_data_set(tmp_path):
+    folder = record(tmp_path / "demos", config(("reach", "drawer", "push"), "serial:1"))
+    demos = morphgen.demos(folder)
+    assert {episode.task for episode in demos.episodes} == {"reach", "drawer", "push"}
+    assert all(each.agrees for each in morphgen.verify(folder, episodes=20))
+    observed, _ = demos.observe(range(len(demos)))
+    assert len(observed["tokens"]) == len(demos)
