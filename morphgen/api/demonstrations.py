@@ -9,12 +9,13 @@ from types import SimpleNamespace
 
 from morphgen.api.training import named_source, with_goal
 from morphgen.arguments import checked_signature, path_argument, require_types, whole_number
+from morphgen.benchmark.demonstrations import Verification, changed_files, describe
 from morphgen.errors import TaskError
 from morphgen.grammar.library import LibraryFolders, library_folders
 from morphgen.rl.demonstrations.reader import Demonstrations
 from morphgen.rl.demonstrations.recording import PLANNER, RecordingConfig
 from morphgen.rl.demonstrations.recording import record as record_episodes
-from morphgen.rl.demonstrations.replay import Replay, choose_episodes, replay
+from morphgen.rl.demonstrations.replay import choose_episodes, replay
 from morphgen.rl.inference import read_controller
 from morphgen.rl.runs.robot_source import Source, drawn_source, other_side, tasks_of
 from morphgen.splits.split import Side, require_side
@@ -108,7 +109,9 @@ def record(
     folder = record_episodes(
         path_argument("out", out or "demos", TaskError), config, jobs=jobs, ray=ray
     )
-    return Demonstrations(folder)
+    data = Demonstrations(folder)
+    describe(data)
+    return data
 
 
 def _sources(given: SimpleNamespace) -> tuple[Source, ...]:
@@ -159,13 +162,14 @@ def demos(path: str | PathLike[str]) -> Demonstrations:
 
 
 @checked_signature
-def verify(path: str | PathLike[str], *, episodes: int = 10, seed: int = 0) -> tuple[Replay, ...]:
-    """Simulate random episodes of demonstrations again, and compare each step.
+def verify(path: str | PathLike[str], *, episodes: int = 10, seed: int = 0) -> Verification:
+    """Simulate random episodes of demonstrations again, and compare each step and all files.
 
     Examples:
         >>> demos = morphgen.record("prims", tasks=["reach"], episodes=2)
-        >>> [(each.agrees, each.joint_error) for each in morphgen.verify("demos", episodes=1)]
-        [(True, 0.0)]
+        >>> verification = morphgen.verify("demos", episodes=1)
+        >>> verification.agrees, verification.replays[0].joint_error
+        (True, 0.0)
 
     Args:
         path: Folder of the data set.
@@ -173,11 +177,12 @@ def verify(path: str | PathLike[str], *, episodes: int = 10, seed: int = 0) -> t
         seed: Seed of their choice.
 
     Returns:
-        Each episode beside the simulated one.
+        The simulated episodes beside the recorded ones, and the files that were changed.
 
     Raises:
         FormatError: If the folder is no complete data set of ``morphgen record``.
     """
     count = whole_number("episodes", episodes, TaskError, 1)
     data = demos(path)
-    return tuple(replay(data, choose_episodes(data, count, seed)))
+    replays = tuple(replay(data, choose_episodes(data, count, seed)))
+    return Verification(replays, changed_files(data.folder))

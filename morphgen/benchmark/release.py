@@ -298,7 +298,7 @@ def card_text(
         id=release.id,
         folder=release.stem,
         difficulty=_difficulty(release, rows),
-        licences=_licence_summary(parts),
+        licences=licence_summary(parts),
         citation=citation(split, release),
     )
     return f"---\n{_front_matter(split, release, parts)}---\n\n{text}"
@@ -311,7 +311,7 @@ def licences_json(parts: Iterable[LicencedPart]) -> str:
 
 def licences_text(parts: Sequence[LicencedPart]) -> str:
     """Return the text of ``LICENCES.md``."""
-    lines = ["# Licences", "", _licence_summary(parts), ""]
+    lines = ["# Licences", "", licence_summary(parts), ""]
     for identifier in licence_ids(parts):
         licence = find_licence(identifier)
         limits = f" ({', '.join(licence.restrictions)})" if licence.restrictions else ""
@@ -368,7 +368,8 @@ def _difficulty(release: Release, rows: Sequence[RobotDifficulty]) -> str:
     )
 
 
-def _licence_summary(parts: Sequence[LicencedPart]) -> str:
+def licence_summary(parts: Sequence[LicencedPart]) -> str:
+    """Return the licences in a sentence, with a line for each part whose licence restricts use."""
     limits = [
         f"**{part.part} is {part.licence.id} ({', '.join(part.licence.restrictions)})**: robots "
         f"{', '.join(dict.fromkeys(name for _, name in part.robots))}."

@@ -6,11 +6,11 @@ import argparse
 from dataclasses import asdict
 
 from morphgen.api import demonstrations
-from morphgen.benchmark.demonstrations import summarize, summary_text
+from morphgen.benchmark.demonstrations import Verification, summarize, summary_text
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar
 from morphgen.rl.demonstrations.reader import Demonstrations
-from morphgen.rl.demonstrations.replay import TOLERANCE, Replay
+from morphgen.rl.demonstrations.replay import TOLERANCE
 from morphgen.tables import table
 
 
@@ -43,13 +43,14 @@ def print_summary(args: argparse.Namespace, demos: Demonstrations) -> None:
 def verify(args: argparse.Namespace) -> int:
     """Simulate episodes again and print how far they are from the recorded ones."""
     with bar(args, "simulating the episodes again", "episode"):
-        replays = demonstrations.verify(**opt.arguments(args, demonstrations.verify))
-    data = [asdict(each) | {"agrees": each.agrees} for each in replays]
-    opt.print_result(args, data, lambda: _text(replays))
-    return int(not all(each.agrees for each in replays))
+        result = demonstrations.verify(**opt.arguments(args, demonstrations.verify))
+    replays = [asdict(each) | {"agrees": each.agrees} for each in result.replays]
+    data = {"replays": replays, "changed_files": result.changed_files}
+    opt.print_result(args, data, lambda: _text(result))
+    return int(not result.agrees)
 
 
-def _text(replays: tuple[Replay, ...]) -> str:
+def _text(result: Verification) -> str:
     headers = ("episode", "robot", "task", "joints", "object [m]", "reward", "success", "agrees")
     rows = [
         (
@@ -62,9 +63,10 @@ def _text(replays: tuple[Replay, ...]) -> str:
             "yes" if each.success else "no",
             "yes" if each.agrees else "no",
         )
-        for each in replays
+        for each in result.replays
     ]
-    faults = [fault for each in replays for fault in each.faults]
-    agreeing = sum(each.agrees for each in replays)
-    last = f"{agreeing} of {len(replays)} episodes agree within {TOLERANCE:g} rad or m"
-    return "\n".join([table(rows, headers), *dict.fromkeys(faults), last])
+    lines = [f"changed: {name}" for name in result.changed_files]
+    lines += [fault for each in result.replays for fault in each.faults]
+    agreeing = sum(each.agrees for each in result.replays)
+    last = f"{agreeing} of {len(result.replays)} episodes agree within {TOLERANCE:g} rad or m"
+    return "\n".join([table(rows, headers), *dict.fromkeys(lines), last])

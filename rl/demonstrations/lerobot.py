@@ -2,8 +2,8 @@
 
 LeRobot itself is not used: it needs other versions of torch and NumPy. Arms differ in their joints:
 features of joints are padded with zeros to the largest robot, and ``joint_count`` says how many are
-real. ``robot_index`` is the place of the robot in ``bodies/index.json``. The same episodes give the
-same bytes with the same version of pyarrow.
+real. ``robot_index`` is the line of the robot in ``bodies/index.jsonl``. The same episodes give
+the same bytes with the same version of pyarrow.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from morphgen.errors import TaskError
 from morphgen.extras import explain_missing_extras
 from morphgen.files import replacing_file, write_cache_file
-from morphgen.formats.data_files import read_json
+from morphgen.formats.data_files import read_json, read_text
 from morphgen.formats.zip_files import read_all
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import CONTROL_PERIOD
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import pyarrow
 
 BODIES = "bodies"  # folder with the bundle of each robot, by its hash
-RECORDING, INDEX, BODY = "recording.json", "bodies/index.json", "body.json"
+RECORDING, INDEX, BODY = "recording.json", "bodies/index.jsonl", "body.json"
 FORMAT = 1  # version of what morphgen adds to the format of LeRobot
 Arrays = dict[str, NDArray[Any]]
 
@@ -185,7 +185,7 @@ def assemble(folder: Path, shards: Mapping[str, Path], tasks: Sequence[str]) -> 
     _write_meta(folder, rows, features, tasks)
     names = ("robot_hash", "name", "category", "derivation", "licences")
     index = [{name: body[name] for name in names} | {"dof": len(body["joints"])} for body in bodies]
-    _write_json(folder / INDEX, index)
+    write_cache_file(folder / INDEX, "".join(f"{json.dumps(row)}\n" for row in index))
     info = {
         "codebase_version": VERSION,
         "robot_type": "morphgen",
@@ -313,6 +313,11 @@ def _write_meta(
 
 def _write_json(path: Path, data: object) -> None:
     write_cache_file(path, json.dumps(data, indent=2) + "\n")
+
+
+def read_index(folder: Path) -> list[dict[str, Any]]:
+    """Return the rows of the robots, which ``robot_index`` refers to."""
+    return [json.loads(line) for line in read_text(folder / INDEX).splitlines()]
 
 
 def read_episodes(folder: Path) -> list[dict[str, Any]]:

@@ -20,11 +20,11 @@ from morphgen.model.robot import Robot
 from morphgen.rl.demonstrations.lerobot import (
     BODIES,
     FORMAT,
-    INDEX,
     INFO,
     RECORDING,
     read_columns,
     read_episodes,
+    read_index,
     require_pyarrow,
 )
 from morphgen.tasks.actions import ActionKind, encode_actions
@@ -119,7 +119,7 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
     @cached_property
     def robot_hashes(self) -> tuple[str, ...]:
         """Hashes of the robots, which ``robot_index`` refers to."""
-        return tuple(body["robot_hash"] for body in read_json(self.folder / INDEX))
+        return tuple(body["robot_hash"] for body in read_index(self.folder))
 
     @cached_property
     def robots(self) -> tuple[Robot, ...]:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +110,7 @@ class RecordingConfig:
             robots.append({k: v for k, v in entries.items() if k not in ("library", "goal_dir")})
         return {
             "format": FORMAT,
+            "morphgen": version("morphgen"),
             "robots": robots,
             "policy": {task: _named(self.policy_for(task)) for task in tasks},
             **{key: getattr(self, key) for key in _KEYS},

@@ -9,9 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from morphgen.formats.bundle import file_findings
 from morphgen.processes import one_torch_thread
-from morphgen.rl.demonstrations.lerobot import BODIES
 from morphgen.rl.demonstrations.reader import Demonstrations, RecordedEpisode, at_links
 from morphgen.rl.demonstrations.recording import step_state
 from morphgen.tasks.goals.split_goals import certify_goal_set
@@ -39,7 +37,7 @@ class Replay:
     success: bool
     """Whether the simulated episode ended in success."""
     faults: tuple[str, ...]
-    """Files of the bundle that were changed, and faults of the goals' certificates."""
+    """Faults of the certificates of its goals."""
 
     @property
     def agrees(self) -> bool:
@@ -85,11 +83,9 @@ def _replay(demos: Demonstrations, episode: RecordedEpisode) -> Replay:
             differences = [(mine - recorded).abs().max() for mine, recorded in pairs]
             errors = torch.maximum(errors, torch.stack(differences))
             success = bool(step.success)
-    folder = demos.folder / BODIES / episode.robot_hash
-    faults = [f"{each.where}: {each.why}" for each in file_findings(folder)]
-    faults += certify_goal_set(spec.goals, spec)
+    faults = certify_goal_set(spec.goals, spec)
     joints, thing, reward = errors.tolist()
-    return Replay(episode, spec.robot.name, joints, thing, reward, success, tuple(faults))
+    return Replay(episode, spec.robot.name, joints, thing, reward, success, faults)
 
 
 _COMPARED = ("observation.state", "observation.object_pose", "next.reward")

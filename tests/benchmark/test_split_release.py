@@ -210,7 +210,7 @@ def test_croissant_is_valid(folder):
 def test_croissant_lists_the_files_that_are_there(folder):
     data = json.loads((folder / CROISSANT_FILE).read_text())
     sums = read_sums(folder / SUMS_FILE)
-    assert data["conformsTo"] == "http://mlcommons.org/croissant/1.0"
+    assert data["conformsTo"] == "http://mlcommons.org/croissant/1.1"
     assert data["license"] == ["https://spdx.org/licenses/MIT.html"]
     files = [each for each in data["distribution"] if each["@type"] == "cr:FileObject"]
     assert all(sums[each["contentUrl"]] == each["sha256"] for each in files)

@@ -8,6 +8,8 @@ import pytest
 import torch
 
 import morphgen
+from morphgen.benchmark.demonstrations import describe
+from morphgen.benchmark.release import CROISSANT_FILE
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import FormatError, MorphgenError, TaskError
 from morphgen.formats.bundle import read_bundle
@@ -16,10 +18,12 @@ from morphgen.rl.baselines import BASELINES
 from morphgen.rl.demonstrations import recording
 from morphgen.rl.demonstrations.lerobot import BODIES, INFO, read_episodes
 from morphgen.rl.demonstrations.recording import RecordingConfig, record
+from morphgen.rl.demonstrations.replay import replay
 from morphgen.rl.inference import run_episodes
 from morphgen.rl.runs.robot_source import drawn_source
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.scenes.make import batch_from_specs
+from morphgen.tasks.scenes.robot_tables import build_robot_tables
 
 pq = pytest.importorskip("pyarrow.parquet")
 
@@ -46,6 +50,15 @@ def config(tasks=("reach",), grammars="prims:1,planar_arm:1", **changes):
 def folder(tmp_path_factory):
     """Two robots at reach, with noise."""
     return record(tmp_path_factory.mktemp("demos") / "demos", config(noise=0.2))
+
+
+@pytest.fixture(scope="module")
+def described(folder, tmp_path_factory):
+    """The same with card, licences, Croissant and hashes."""
+    copy = tmp_path_factory.mktemp("described") / "demos"
+    shutil.copytree(folder, copy)
+    describe(morphgen.demos(copy))
+    return copy
 
 
 @pytest.fixture
@@ -121,8 +134,6 @@ def test_the_label_is_the_planners_own_action_and_not_the_noisy_one(demos):
     assert (label - executed).abs().max() > 0.1
     targets, action = demos.columns["observation.targets"], demos.columns["action"]
     rows = demos.columns["robot_index"] == 0
-    from morphgen.tasks.scenes.robot_tables import build_robot_tables
-
     tables = build_robot_tables(demos.robots[:1])
     dof = demos.robots[0].dof
     wanted = targets[rows, :dof] + label[rows, :dof] * tables.max_step[0]
@@ -224,16 +235,51 @@ def test_recorded_results_are_those_of_the_policy(demos):
         assert not demos.columns["next.done"][list(episode.frames[:-1])].any()
 
 
-def test_replays_agree_and_tell_changes(folder, tmp_path):
-    for each in morphgen.verify(folder, episodes=2):
-        assert each.agrees
+def test_verify_replays_episodes_and_names_changed_files(described, tmp_path):
+    result = morphgen.verify(described, episodes=2)
+    assert result.agrees
+    for each in result.replays:
         assert each.joint_error == each.object_error == each.reward_error == 0
     copy = tmp_path / "demos"
-    shutil.copytree(folder, copy)
+    shutil.copytree(described, copy)
     urdf = next(copy.glob("bodies/*/robot.urdf"))
-    urdf.write_text(urdf.read_text().replace("<robot", "<!-- mine --><robot", 1))
-    replays = morphgen.verify(copy, episodes=4)
-    assert sorted({bool(each.faults) for each in replays}) == [False, True]
+    urdf.write_text(urdf.read_text() + "<!-- mine -->")
+    result = morphgen.verify(copy, episodes=1)
+    assert result.changed_files == (str(urdf.relative_to(copy)),)
+    assert not result.agrees
+
+
+def test_verify_tells_other_actions(described, tmp_path):
+    copy = tmp_path / "demos"
+    shutil.copytree(described, copy)
+    (path,) = copy.glob("data/*/*.parquet")
+    table = pq.read_table(path)
+    place = table.column_names.index("executed_action")
+    reverse = table["executed_action"].take(list(range(len(table)))[::-1])
+    pq.write_table(table.set_column(place, table.schema.field(place), reverse), path)
+    assert not any(each.agrees for each in morphgen.verify(copy, episodes=4).replays)
+
+
+def test_croissant_is_valid_and_reads_all_records(described):
+    mlcroissant = pytest.importorskip("mlcroissant")
+    dataset = mlcroissant.Dataset(jsonld=described / CROISSANT_FILE)
+    issues = dataset.metadata.ctx.issues
+    assert (issues.errors, len(issues.warnings)) == (set(), 1)  # it has no date
+    data = json.loads((described / CROISSANT_FILE).read_text())
+    assert data["conformsTo"] == "http://mlcommons.org/croissant/1.1"
+    assert data["prov:wasGeneratedBy"]["prov:wasAssociatedWith"]["prov:label"].startswith("morph")
+    demos = morphgen.demos(described)
+    robots, episodes, steps = (list(dataset.records(n)) for n in ("robots", "episodes", "steps"))
+    assert [each["robots/robot_hash"].decode() for each in robots] == [*demos.robot_hashes]
+    assert [each["episodes/seed"] for each in episodes] == [each.seed for each in demos.episodes]
+    assert len(steps) == len(demos)
+
+
+def test_the_card_has_licences_and_results(described):
+    text = (described / "README.md").read_text()
+    assert "license: mit" in text
+    assert "| reach  | ik " in text
+    assert "prims-000000" in (described / "LICENCES.md").read_text()
 
 
 @pytest.mark.slow
@@ -241,6 +287,6 @@ def test_tasks_with_objects_share_a_data_set(tmp_path):
     folder = record(tmp_path / "demos", config(("reach", "drawer", "push"), "serial:1"))
     demos = morphgen.demos(folder)
     assert {episode.task for episode in demos.episodes} == {"reach", "drawer", "push"}
-    assert all(each.agrees for each in morphgen.verify(folder, episodes=20))
+    assert all(each.agrees for each in replay(demos, range(len(demos.episodes))))
     observed, _ = demos.observe(range(len(demos)))
     assert len(observed["tokens"]) == len(demos)
