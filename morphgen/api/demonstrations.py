@@ -35,6 +35,8 @@ def record(
     seed: int = 0,
     noise: float = 0.0,
     only_success: bool = False,
+    cameras: Sequence[str] = (),
+    depth: bool = False,
     hold: int = 25,
     sim: str | None = None,
     goal: str | None = None,
@@ -67,6 +69,8 @@ def record(
         seed: Seed of the episodes, of the policy and of the noise.
         noise: Standard deviation of noise on the normalized actions; the labels have none.
         only_success: Whether to keep only the episodes that end in success.
+        cameras: Cameras whose videos are added, ``front`` and ``wrist``.
+        depth: Whether the cameras also have depths.
         hold: Control steps in success, one after another, that end an episode.
         sim: Name of the simulator, by default ``mujoco``.
         goal: Goal of reach, ``position`` or ``pose``; by default that of the policy.
@@ -101,6 +105,8 @@ def record(
         noise=float(noise),
         hold=hold,
         only_success=only_success,
+        cameras=tuple(cameras),  # type: ignore[arg-type]  # checked before anything is recorded
+        depth=depth,
         sim=sim or DEFAULT_SIMULATOR,
     )
     names = tuple(dict.fromkeys(task for source in sources for task in tasks_of(source)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from string import Template
 from typing import Any
 
@@ -210,6 +210,7 @@ def _croissant(
         "episodes": ("application/x-parquet", "meta/episodes/*/*.parquet", "Episodes"),
         "urdf": ("application/xml", f"{BODIES}/*/robot.urdf", "The URDF of every robot"),
         "mjcf": ("application/xml", f"{BODIES}/*/robot.xml", "The MJCF of every robot"),
+        "videos": ("video/mp4", "videos/*/*/*.mp4", "Videos of the cameras, by feature"),
         "goals": ("application/x-npz", f"{BODIES}/*/goals/*.npz", "Certified goals"),
     }
     data["distribution"] = [
@@ -223,7 +224,9 @@ def _croissant(
     ] + [
         {**_named("cr:FileSet", f"{key}-files", about), "encodingFormat": kind, "includes": glob}
         for key, (kind, glob, about) in sets.items()
+        if any(PurePosixPath(name).match(glob) for name in sums)
     ]
+    steps = {name: each for name, each in info["features"].items() if each["dtype"] != "video"}
     episodes = ("episode_index", "robot_hash", "task", "policy", "seed", "success", "length")
     rows = read_index(demos.folder)[0]
     data["recordSet"] = [
@@ -236,7 +239,7 @@ def _croissant(
                 for key in episodes
             },
         ),
-        _records("steps", {"fileSet": {"@id": "steps-files"}}, info["features"]),
+        _records("steps", {"fileSet": {"@id": "steps-files"}}, steps),
     ]
     return json.dumps(data, indent=2, ensure_ascii=False) + "\n"
 

@@ -9,6 +9,7 @@ the same bytes with the same version of pyarrow.
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -115,13 +116,24 @@ def read_shard(path: Path) -> tuple[list[dict[str, Any]], Arrays]:
     return json.loads(str(arrays.pop("episodes"))), arrays
 
 
-def assemble(folder: Path, shards: Mapping[str, Path], tasks: Sequence[str]) -> None:
+def video_path(shard: Path, feature: str) -> Path:
+    """Return the video of a feature in the episodes of a shard."""
+    return shard.with_suffix(f".{feature}.mp4")
+
+
+def assemble(
+    folder: Path,
+    shards: Mapping[str, Path],
+    tasks: Sequence[str],
+    videos: Mapping[str, Mapping[str, Any]],
+) -> None:
     """Write the files of the format from at least one episode; ``meta/info.json`` last.
 
     Args:
         folder: The data set, with the robots.
         shards: Shard of each robot by its hash, in order.
         tasks: Names of the tasks.
+        videos: Features of the cameras.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -133,7 +145,7 @@ def assemble(folder: Path, shards: Mapping[str, Path], tasks: Sequence[str]) -> 
     columns = [(name, feature.column) for name, feature in features.items()]
     schema = pa.schema(columns)
     rows: list[dict[str, Any]] = []
-    num_frames = file_index = 0
+    num_frames = file_index = num_videos = 0
     writer = None
     path = folder / DATA_PATH.format(chunk_index=0, file_index=0)
     for robot_index, (robot, shard) in enumerate(shards.items()):
@@ -155,7 +167,7 @@ def assemble(folder: Path, shards: Mapping[str, Path], tasks: Sequence[str]) -> 
         tables["task_index"] = np.repeat([tasks.index(e["task"]) for e in episodes], lengths)
         writer.write_table(pa.table([_array(tables[n], t) for n, t in columns], schema=schema))
         for episode, start in zip(episodes, np.cumsum([0, *lengths]).tolist(), strict=False):
-            length = episode.pop("length")
+            length, shown = episode.pop("length"), episode.pop("videos", {})
             own = {name: values[start : start + length] for name, values in tables.items()}
             rows.append(
                 {
@@ -172,8 +184,14 @@ def assemble(folder: Path, shards: Mapping[str, Path], tasks: Sequence[str]) -> 
                     "joint_count": dofs[robot_index],
                     **episode,
                     **_statistics(own),
+                    **_video_columns(shown, length, num_videos),
                 }
             )
+        for name in videos:
+            target = folder / VIDEO_PATH.format(video_key=name, **_place(num_videos))
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(video_path(shard, name), target)
+        num_videos += 1
         num_frames += sum(lengths)
         if path.stat().st_size > DATA_MB * 2**20:
             writer.close()
@@ -182,7 +200,7 @@ def assemble(folder: Path, shards: Mapping[str, Path], tasks: Sequence[str]) -> 
         raise TaskError(f"{folder}: no episode ended in success, and nothing else is to be kept")
     if writer is not None:
         writer.close()
-    _write_meta(folder, rows, features, tasks)
+    _write_meta(folder, rows, [*features, *videos], tasks)
     names = ("robot_hash", "name", "category", "derivation", "licences")
     index = [{name: body[name] for name in names} | {"dof": len(body["joints"])} for body in bodies]
     write_cache_file(folder / INDEX, "".join(f"{json.dumps(row)}\n" for row in index))
@@ -198,8 +216,8 @@ def assemble(folder: Path, shards: Mapping[str, Path], tasks: Sequence[str]) -> 
         "fps": FPS,
         "splits": {"train": f"0:{len(rows)}"},
         "data_path": DATA_PATH,
-        "video_path": None,
-        "features": {name: feature.as_data() for name, feature in features.items()},
+        "video_path": VIDEO_PATH if videos else None,
+        "features": {name: feature.as_data() for name, feature in features.items()} | dict(videos),
     }
     _write_json(folder / INFO, info)
 
@@ -245,18 +263,34 @@ def _array(values: NDArray[Any], kind: pyarrow.DataType) -> pyarrow.Array:
     return pa.FixedSizeListArray.from_arrays(flat, kind.list_size)
 
 
+def moments(values: NDArray[np.float64]) -> Arrays:
+    """Return the statistics of rows (n, k) that LeRobot wants, each of the shape (k,)."""
+    quantiles = np.quantile(values, QUANTILES, axis=0)
+    return {
+        "min": values.min(axis=0),
+        "max": values.max(axis=0),
+        "mean": values.mean(axis=0),
+        "std": values.std(axis=0),
+        **{f"q{round(100 * q):02d}": row for q, row in zip(QUANTILES, quantiles, strict=True)},
+    }
+
+
+def _video_columns(shown: Mapping[str, Any], length: int, file_index: int) -> dict[str, Any]:
+    """Return where an episode is in the videos, and their statistics, as columns of its row."""
+    columns: dict[str, Any] = {}
+    for name, video in shown.items():
+        columns |= {f"videos/{name}/{key}": value for key, value in _place(file_index).items()}
+        columns[f"videos/{name}/from_timestamp"] = video["first"] / FPS
+        columns[f"videos/{name}/to_timestamp"] = (video["first"] + length) / FPS
+        columns |= {f"stats/{name}/{key}": value for key, value in video["stats"].items()}
+    return columns
+
+
 def _statistics(columns: Arrays) -> dict[str, list[float] | list[int]]:
     """Return the statistics of an episode, as columns of its row."""
     wide = {name: values.reshape(len(values), -1) for name, values in columns.items()}
     joined = np.concatenate(list(wide.values()), axis=1, dtype=np.float64)
-    quantiles = np.quantile(joined, QUANTILES, axis=0)
-    results = {
-        "min": joined.min(axis=0),
-        "max": joined.max(axis=0),
-        "mean": joined.mean(axis=0),
-        "std": joined.std(axis=0),
-        **{f"q{round(100 * q):02d}": row for q, row in zip(QUANTILES, quantiles, strict=True)},
-    }
+    results = moments(joined)
     statistics: dict[str, list[float] | list[int]] = {}
     start = 0
     for name, values in wide.items():
@@ -271,7 +305,7 @@ def _statistics(columns: Arrays) -> dict[str, list[float] | list[int]]:
 def _write_meta(
     folder: Path,
     rows: Sequence[Mapping[str, Any]],
-    features: Mapping[str, _Feature],
+    features: Sequence[str],
     tasks: Sequence[str],
 ) -> None:
     """Write the tasks, the episodes and the statistics of all episodes."""
@@ -295,19 +329,21 @@ def _write_meta(
         with replacing_file(folder / name) as partial:
             pq.write_table(table, partial, compression="zstd")
     stats: dict[str, dict[str, list[float]]] = {}
-    counts = np.array([row["length"] for row in rows], np.float64)[:, None]
     for name in features:
         own = {
             key: np.array([row[f"stats/{name}/{key}"] for row in rows])
             for key in ("min", "max", "mean", "std", *(f"q{round(100 * q):02d}" for q in QUANTILES))
         }
+        total = sum(row[f"stats/{name}/count"][0] for row in rows)
+        counts = np.array([row[f"stats/{name}/count"][0] for row in rows], np.float64)
+        counts = counts.reshape(-1, *[1] * (own["min"].ndim - 1))
         # As LeRobot does: quantiles are means of those of the episodes.
-        merged = {key: (own[key] * counts).sum(axis=0) / counts.sum() for key in own}
+        merged = {key: (own[key] * counts).sum(axis=0) / total for key in own}
         spread = own["std"] ** 2 + (own["mean"] - merged["mean"]) ** 2
-        merged["std"] = np.sqrt((spread * counts).sum(axis=0) / counts.sum())
+        merged["std"] = np.sqrt((spread * counts).sum(axis=0) / total)
         merged |= {"min": own["min"].min(axis=0), "max": own["max"].max(axis=0)}
         stats[name] = {key: values.tolist() for key, values in merged.items()}
-        stats[name]["count"] = [int(counts.sum())]
+        stats[name]["count"] = [total]
     _write_json(folder / STATS, stats)
 
 

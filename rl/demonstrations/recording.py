@@ -37,6 +37,7 @@ from morphgen.model.robot import TOOL, Robot
 from morphgen.processes import one_torch_thread, parallel_map, ray_cluster, require_ray
 from morphgen.progress import report, stage
 from morphgen.rl.baselines import BASELINES, Controller, baselines_for
+from morphgen.rl.demonstrations.cameras import filming, require_cameras, video_features
 from morphgen.rl.demonstrations.lerobot import (
     BODIES,
     BODY,
@@ -46,6 +47,7 @@ from morphgen.rl.demonstrations.lerobot import (
     Arrays,
     assemble,
     require_pyarrow,
+    video_path,
 )
 from morphgen.rl.inference import EpisodeResults, make_controller, read_controller
 from morphgen.rl.runs.robot_source import (
@@ -63,6 +65,7 @@ from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.goals.goal_sets import set_npz
 from morphgen.tasks.goals.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
+from morphgen.tasks.render.renderer import Camera
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot
 from morphgen.tasks.scenes.make import batch_from_specs
 from morphgen.tasks.task import EnvSpec, GoalSet
@@ -94,6 +97,10 @@ class RecordingConfig:
     only_success: bool = False
     """Whether to keep only the episodes that end in success."""
     sim: str = DEFAULT_SIMULATOR
+    cameras: tuple[Camera, ...] = ()
+    """Cameras whose videos are added, ``front`` and ``wrist``."""
+    depth: bool = False
+    """Whether cameras also have depths."""
     goals: GoalConfig = field(default_factory=GoalConfig)
 
     def policy_for(self, task: str) -> str:
@@ -118,7 +125,7 @@ class RecordingConfig:
         }
 
 
-_KEYS = ("episodes", "seed", "noise", "hold", "only_success", "sim")
+_KEYS = ("episodes", "seed", "noise", "hold", "only_success", "sim", "cameras", "depth")
 
 
 def _named(policy: str) -> str:
@@ -183,6 +190,7 @@ def record(folder: Path, config: RecordingConfig, *, jobs: int = 1, ray: str | N
         ray: Address of a Ray cluster, or an empty text for a local one; None for processes.
     """
     require_pyarrow()
+    require_cameras(config.cameras, depth=config.depth)
     require_writable_folder(folder)
     robots = robots_of(config, jobs)
     tasks = tuple(dict.fromkeys(task for robot in robots for task, _ in robot.tasks))
@@ -201,7 +209,8 @@ def record(folder: Path, config: RecordingConfig, *, jobs: int = 1, ray: str | N
             for _ in run:
                 pass
         try:
-            assemble(folder, {r.robot_hash: _shard(folder, r) for r in robots}, tasks)
+            shards = {robot.robot_hash: _shard(folder, robot) for robot in robots}
+            assemble(folder, shards, tasks, video_features(config.cameras, depth=config.depth))
         except TaskError:  # no episode succeeded: leave nothing behind
             for name in (BODIES, SHARDS):
                 shutil.rmtree(folder / name)
@@ -271,23 +280,27 @@ def record_robot(folder: Path, config: RecordingConfig, unit: RecordedRobot) -> 
     goals: dict[str, dict[str, Any]] = {}
     fields = {f"field.{f.name}": f.size for task, _ in unit.tasks for f in TASKS[task].fields}
     (body / "goals").mkdir()
-    for task, obstacles in unit.tasks:
-        shipped = _shipped(unit)
-        spec = env_spec(
-            robot,
-            task,
-            replace(config.goals, seed=unit.source.goal_seed),
-            obstacles=obstacles,
-            shipped=shipped,
-        )
-        (body / "goals" / f"{task}.npz").write_bytes(set_npz(spec.goals))
-        goals[task] = {"key": spec.goals.key, "obstacles": obstacles}
-        for episode, frames in _record_task(spec, config, unit.robot_hash):
-            episodes.append(episode)
-            others = {k: np.zeros((episode["length"], n), np.float32) for k, n in fields.items()}
-            for name, values in (others | frames).items():
-                arrays.setdefault(name, []).append(values)
-    _write_body(body, robot, unit, goals, library)
+    path_of = partial(video_path, _shard(folder, unit))
+    with filming(config.cameras, path_of, depth=config.depth) as film:
+        for task, obstacles in unit.tasks:
+            spec = env_spec(
+                robot,
+                task,
+                replace(config.goals, seed=unit.source.goal_seed),
+                obstacles=obstacles,
+                shipped=_shipped(unit),
+            )
+            (body / "goals" / f"{task}.npz").write_bytes(set_npz(spec.goals))
+            goals[task] = {"key": spec.goals.key, "obstacles": obstacles}
+            for episode, frames in _record_task(spec, config, unit.robot_hash):
+                if config.cameras:
+                    episode["videos"] = film.add(spec, episode["seed"], frames)
+                episodes.append(episode)
+                length = episode["length"]
+                others = {k: np.zeros((length, n), np.float32) for k, n in fields.items()}
+                for name, values in (others | frames).items():
+                    arrays.setdefault(name, []).append(values)
+    _write_body(body, robot, unit, goals, library, film.poses)
     joined = {name: np.concatenate(values) for name, values in arrays.items()}
     joined["episodes"] = np.array(json.dumps(episodes))
     content = io.BytesIO()
@@ -311,6 +324,7 @@ def _write_body(
     unit: RecordedRobot,
     goals: Mapping[str, Mapping[str, Any]],
     library: Library,
+    cameras: Mapping[str, Any],
 ) -> None:
     """Write tokens and a summary of a robot beside its bundle."""
     names = [link.name for link in robot.links]
@@ -343,6 +357,7 @@ def _write_body(
         "joints": joints,
         "tool": {"link": tool.link, **asdict(tool.T_link_frame)},
         "goals": goals,
+        **({"cameras": cameras} if cameras else {}),
     }
     (body / BODY).write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
 

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import imageio.v2 as imageio
 import imageio_ffmpeg
@@ -26,9 +26,10 @@ from morphgen.formats.bundle import split_colours
 from morphgen.formats.files import require_writable_file
 from morphgen.formats.mjcf.write import to_spec
 from morphgen.formats.picture import gl_context
+from morphgen.model.geometry import Pose
 from morphgen.model.inertia import bounding_box, box_corners
 from morphgen.model.kinematics import forward_kinematics, movable_positions
-from morphgen.model.robot import Robot
+from morphgen.model.robot import TOOL, Robot
 from morphgen.model.rotation import Vec3
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.registry import TASKS
@@ -154,10 +155,25 @@ def _robot_corners(robot: Robot, q: Array) -> list[Array]:
 
 Frame = NDArray[np.uint8]
 
+
+def look_at(position: Vec3, target: Vec3) -> Pose:
+    """Return the pose of a camera that looks along its -z at a target, with x about upwards."""
+    back = np.subtract(position, target) / np.linalg.norm(np.subtract(position, target))
+    right = np.cross((1.0, 0.0, 0.0), back)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([right, np.cross(back, right), back, position], axis=1)
+    return Pose.from_matrix(matrix)
+
+
 SIZE = (640, 480)  # width and height of a frame [pixels]
 SUFFIXES = (".mp4", ".gif")  # suffixes of video files
 
-_FOV = 35.0  # vertical field of view [degrees]
+Camera = Literal["front", "wrist"]
+FRONT_FOV, WRIST_FOV = 35.0, 70.0  # vertical fields of view of the cameras [degrees]
+WRIST = look_at((0.15, 0.0, -0.15), (0.0, 0.0, 0.05))
+"""Pose of the camera ``wrist`` in the tool frame: beside and behind the tool, it looks at what is
+before the tool, along its own -z; y is up."""
 _AZIMUTH, _ELEVATION = 220.0, -25.0
 """MuJoCo camera angles [degrees]: from ahead and the left, so that no tool hides the block."""
 _MARGIN = 0.92  # fraction of the picture that the points in view fill
@@ -215,7 +231,7 @@ class Renderer:
         if scene.ground is not None:
             self.points = self.points[self.points[:, 2] >= scene.ground - 1e-6]
         self._model = model = self._compiled(scene, markers)
-        model.vis.global_.fovy = _FOV
+        model.vis.global_.fovy = FRONT_FOV
         model.vis.global_.offwidth, model.vis.global_.offheight = size
         model.vis.quality.shadowsize, model.vis.quality.offsamples = _SHADOW_SIZE, 0
         low, high = self.points.min(axis=0), self.points.max(axis=0)
@@ -255,7 +271,18 @@ class Renderer:
                 add_shape(base, shape).rgba = shape.rgba or _OBSTACLE
         for marker in markers:
             bodies[marker.name] = _add_marker(spec, marker)
+        if any(frame.name == TOOL for frame in scene.robot.frames):
+            tool = scene.robot.frame(TOOL)
+            T_link_camera = Pose.from_matrix(tool.T_link_frame.matrix @ WRIST.matrix)
+            spec.body(tool.link).add_camera(
+                name="wrist",
+                pos=T_link_camera.position,
+                quat=T_link_camera.quaternion,
+                fovy=WRIST_FOV,
+            )
         model = spec.compile()
+        self._wrist = mujoco.MjvCamera()
+        self._wrist.type, self._wrist.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
         names = [scene.robot.joints[k].name for k in scene.robot.movable_joints]
         self._q_at = [int(model.joint(name).qposadr[0]) for name in names]
         self._mocap = {name: int(model.body_mocapid[body.id]) for name, body in bodies.items()}
@@ -281,6 +308,38 @@ class Renderer:
 
         It is on a turntable in front of a fixed camera: camera and light go around its middle.
         """
+        self._turn_view(turn)
+        self._place(state)
+        self._look(self._camera)
+        return self._pixels()[0]
+
+    def view(self, state: RenderState, camera: Camera = "front") -> tuple[Frame, Array]:
+        """Render a state by a camera: pixels (height, width, 3), and depths (height, width) [m].
+
+        ``front`` is the camera of ``frame``; ``wrist`` moves with the tool, see ``WRIST``.
+        """
+        self._turn_view(0.0)
+        self._place(state)
+        self._look(self._camera if camera == "front" else self._wrist)
+        pixels, depth = self._pixels()
+        extent, planes = self._model.stat.extent, self._model.vis.map
+        near, far = planes.znear * extent, planes.zfar * extent
+        return pixels, near / (1 - depth * (1 - near / far))  # OpenGL's depths are 0 to 1
+
+    @property
+    def front(self) -> Pose:
+        """Pose of the camera ``front`` in the world; it looks along -z, and y is up."""
+        self._look(self._camera)
+        eyes = self._scene.camera[:2]
+        up = eyes[0].up.astype(np.float64)
+        back = -eyes[0].forward.astype(np.float64)
+        matrix = np.eye(4)
+        matrix[:3, :3] = np.stack([np.cross(up, back), up, back], axis=1)
+        matrix[:3, 3] = (eyes[0].pos + eyes[1].pos) / 2
+        return Pose.from_matrix(matrix)
+
+    def _place(self, state: RenderState) -> None:
+        """Put everything where it is in a state."""
         if self._closed:
             raise ValueError("this renderer is closed")
         model, data = self._model, self._data
@@ -294,13 +353,15 @@ class Renderer:
         if state.obstacles is not None:
             for index, pose in zip(self._obstacles, state.obstacles, strict=True):
                 data.mocap_pos[index], data.mocap_quat[index] = pose[:3], pose[3:]
-        self._turn_view(turn)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
+
+    def _look(self, camera: mujoco.MjvCamera) -> None:
+        """Fill the scene as a camera sees it."""
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         options = mujoco.MjvOption()
-        mujoco.mjv_updateScene(model, data, options, None, self._camera, everything, self._scene)
-        return self._pixels()
+        data = self._data
+        mujoco.mjv_updateScene(self._model, data, options, None, camera, everything, self._scene)
 
     def close(self) -> None:
         """Free the OpenGL context; a second call does nothing."""
@@ -320,15 +381,16 @@ class Renderer:
         model.light_pos[:] = middle + rotation.apply(light_position - middle)
         model.light_dir[:] = rotation.apply(light_direction)
 
-    def _pixels(self) -> Frame:
-        """Render the scene; return its pixels with the top row first."""
+    def _pixels(self) -> tuple[Frame, NDArray[np.float32]]:
+        """Render the scene; return pixels and OpenGL's depths with the top row first."""
         width, height = self.size
         pixels = np.empty((height, width, 3), dtype=np.uint8)
+        depth = np.empty((height, width), dtype=np.float32)
         rectangle = mujoco.MjrRect(0, 0, width, height)
         self._context.make_current()  # another renderer may have been drawing
         mujoco.mjr_render(rectangle, self._scene, self._gpu)
-        mujoco.mjr_readPixels(pixels, None, rectangle, self._gpu)
-        return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest
+        mujoco.mjr_readPixels(pixels, depth, rectangle, self._gpu)
+        return np.ascontiguousarray(pixels[::-1]), depth[::-1]  # OpenGL's first row is the lowest
 
 
 def render_state(batch: TaskBatch, env: int = 0) -> RenderState:
@@ -373,7 +435,7 @@ def write_video(frames: Iterable[Frame], path: Path, fps: float) -> None:
             if image:
                 partial.write_bytes(image.getvalue())
             else:
-                _require_complete(partial, written, path)
+                require_complete(partial, written, path)
     except OSError as error:
         raise FormatError(f"cannot write {path}: {error.strerror or error}") from error
 
@@ -393,7 +455,7 @@ def _append(writer: Any, frame: Frame, path: Path) -> None:  # noqa: ANN401 - im
         raise FormatError(f"cannot write {path}: {error}") from error
 
 
-def _require_complete(video: Path, frames: int, path: Path) -> None:
+def require_complete(video: Path, frames: int, path: Path) -> None:
     """Require that a video has all frames: imageio does not report ffmpeg's exit code."""
     hint = "is the disk full, or was ffmpeg ended?"
     try:
@@ -434,7 +496,7 @@ def _camera(points: NDArray[np.float64], aspect: float) -> mujoco.MjvCamera:
     rotation = Rotation.from_euler("ZX", [_AZIMUTH - 90, _ELEVATION], degrees=True)
     R_world_camera = rotation.as_matrix()
     across, ahead, up = (points @ R_world_camera).T
-    half = _MARGIN * math.tan(math.radians(_FOV / 2))
+    half = _MARGIN * math.tan(math.radians(FRONT_FOV / 2))
     centres, distances = [], []
     for v, t in ((across, half * aspect), (up, half)):
         p, n = (v / t - ahead).max(), (-v / t - ahead).max()

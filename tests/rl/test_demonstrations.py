@@ -1,8 +1,11 @@
 """Demonstrations: recording, the files, what readers see, and replay."""
 
 import json
+import math
 import shutil
+from contextlib import closing
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
@@ -14,14 +17,17 @@ from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import FormatError, MorphgenError, TaskError
 from morphgen.formats.bundle import read_bundle
 from morphgen.formats.files import folder_hashes
+from morphgen.model.kinematics import frame_pose
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.demonstrations import recording
+from morphgen.rl.demonstrations.cameras import DEPTH_MAX, DEPTH_MIN, DEPTH_SHIFT, depth_code
 from morphgen.rl.demonstrations.lerobot import BODIES, INFO, read_episodes
 from morphgen.rl.demonstrations.recording import RecordingConfig, record
 from morphgen.rl.demonstrations.replay import replay
 from morphgen.rl.inference import run_episodes
 from morphgen.rl.runs.robot_source import drawn_source
 from morphgen.tasks.observation import ObservationConfig
+from morphgen.tasks.render.renderer import FRONT_FOV, WRIST, Renderer, RenderState
 from morphgen.tasks.scenes.make import batch_from_specs
 from morphgen.tasks.scenes.robot_tables import build_robot_tables
 
@@ -197,6 +203,8 @@ def test_a_folder_of_something_else_is_refused(folder, tmp_path):
         ({}, "either robots"),
         ({"drawn": "prims"}, "is not a grammar and a number"),
         ({"drawn": "prims:1", "sim": "best"}, "unknown simulator 'best'"),
+        ({"drawn": "prims:1", "cameras": ["back"]}, "unknown camera 'back'"),
+        ({"drawn": "prims:1", "depth": True}, "depth: only with cameras"),
     ],
 )
 def test_invalid_arguments_write_nothing(tmp_path, arguments, match):
@@ -290,3 +298,59 @@ def test_tasks_with_objects_share_a_data_set(tmp_path):
     assert all(each.agrees for each in replay(demos, range(len(demos.episodes))))
     observed, _ = demos.observe(range(len(demos)))
     assert len(observed["tokens"]) == len(demos)
+
+
+def test_depths_are_coded_as_lerobot_does():
+    depth = np.geomspace(DEPTH_MIN, DEPTH_MAX, 1000)
+    low, high = np.log(DEPTH_MIN + DEPTH_SHIFT), np.log(DEPTH_MAX + DEPTH_SHIFT)
+    decoded = np.exp(depth_code(depth) / 4095 * (high - low) + low) - DEPTH_SHIFT
+    half_a_code = (DEPTH_MAX + DEPTH_SHIFT) * (high - low) / 4095 / 2
+    assert abs(decoded - depth).max() < 1.01 * half_a_code
+    assert depth_code(np.array([0.0, 99.0])).tolist() == [0, 4095]
+
+
+@pytest.mark.slow
+def test_cameras_add_videos(tmp_path):
+    folder = record(tmp_path / "demos", config(cameras=("front", "wrist"), depth=True))
+    demos = morphgen.demos(folder)
+    info = json.loads((folder / INFO).read_text())
+    names = [name for name, each in info["features"].items() if each["dtype"] == "video"]
+    assert names == [
+        *("observation.images.front", "observation.images.front_depth"),
+        *("observation.images.wrist", "observation.images.wrist_depth"),
+    ]
+    rows = read_episodes(folder)
+    stats = json.loads((folder / "meta/stats.json").read_text())
+    for name in names:
+        channels = info["features"][name]["shape"][2]
+        assert np.shape(stats[name]["mean"]) == (channels, 1, 1)
+        for file in range(len(demos.robots)):
+            path = folder / f"videos/{name}/chunk-000/file-{file:03d}.mp4"
+            own = [row for row in rows if row[f"videos/{name}/file_index"] == file]
+            count, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
+            assert count == sum(row["length"] for row in own)
+            ends = [row[f"videos/{name}/to_timestamp"] for row in own]
+            starts = [row[f"videos/{name}/from_timestamp"] for row in own]
+            assert [0.0, *ends] == [*starts, count / 50]
+    cameras = json.loads((folder / BODIES / demos.robot_hashes[0] / "body.json").read_text())
+    assert set(cameras["cameras"]["front"]["T_world_camera"]) == {"reach"}
+    again = record(tmp_path / "again" / "demos", config(cameras=("front", "wrist"), depth=True))
+    assert folder_hashes(again) == folder_hashes(folder)
+
+
+@pytest.mark.slow
+def test_views_are_those_of_the_documented_poses(demos):
+    spec = demos.specs[0, "reach"]
+    with closing(Renderer.of_spec(spec, (64, 64))) as renderer:
+        state = RenderState(np.array(spec.robot.home, np.float32))
+        pixels, depth = renderer.view(state, "front")
+        assert np.array_equal(pixels, renderer.frame(state))
+        # The lowest row sees the ground: a ray through it from the pose meets z = 0 there.
+        pose, half = renderer.front, math.tan(math.radians(FRONT_FOV / 2))
+        ray = pose.matrix[:3, :3] @ (half / 64, -half * 63 / 64, -1.0)
+        assert depth[-1, 32] == pytest.approx(-pose.position[2] / ray[2], rel=1e-3)
+        renderer.view(state, "wrist")
+        T = frame_pose(spec.robot, np.array([spec.robot.home]))[0] @ WRIST.matrix
+        eyes = renderer._scene.camera
+        np.testing.assert_allclose((eyes[0].pos + eyes[1].pos) / 2, T[:3, 3], atol=1e-5)
+        np.testing.assert_allclose(eyes[0].forward, -T[:3, 2], atol=1e-5)

@@ -129,7 +129,7 @@ def test_camera_frames_the_whole_scene(name, request):
     up = np.cross(right, forward)
     seen = points - (camera.lookat - camera.distance * forward)
     depth = seen @ forward
-    half = np.tan(np.radians(renderer._FOV / 2))
+    half = np.tan(np.radians(renderer.FRONT_FOV / 2))
     vertical = seen @ up / depth / half
     across = seen @ right / depth / (half * 4 / 3)
     assert depth.min() > 0
