@@ -46,6 +46,8 @@ SPLITS = (
     "extrapolation/arms-small",
 )
 FIGURE_SPLITS = SPLITS[:5]
+OBJECTS = ("drawer", "door", "dial")
+OBJECT_SPLITS = (*SPLITS[:3], "extrapolation/primitives-sliding", "extrapolation/arms")
 TUNED_STEPS = (10_000, 30_000)
 PAPER_AGENT = "-symlog-slow-critic-discrete"
 CHANNELS = "+normalize+lag+joint+poses+jacobian+dls"
@@ -131,6 +133,28 @@ def summary_table() -> str:
                 rates[agent] = row.sides["test"].success.as_percent() if "test" in row.sides else ""
             lines.append([f"{split}/{task}", *(rates.get(agent, "") for agent in (*columns, best))])
     headers = ["split", *(AGENTS[agent] for agent in columns), "`ik`; push: `scripted`"]
+    return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
+
+
+def objects_table() -> str:
+    """Return success at drawer, door and dial on each split, by agent and side."""
+    lines = []
+    for split in OBJECT_SPLITS:
+        found = [results_of("objects-30m", f"{split}/{task}") for task in OBJECTS]
+        keys = {key for rows in found for key in rows}
+        order = [*AGENTS, *BASELINES]
+        for key in sorted(keys, key=lambda key: order.index(key[0])):
+            rows = [each.get(key) for each in found]
+            seeds = min((len(row.seeds) for row in rows if row), default=0)
+            cells = [
+                row.sides[side].success.as_percent() if row and side in row.sides else ""
+                for row in rows
+                for side in SIDES
+            ]
+            lines.append([split, *_run_cells(*key, seeds), *cells])
+            split = ""
+    headers = ["split", "agent", "transitions", "seeds"]
+    headers += [f"{task}, {side}" for task in OBJECTS for side in ("MT", "ZS")]
     return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
 
 
@@ -361,6 +385,7 @@ def _all_tables() -> dict[str, str]:
     return {
         **{task: split_table(task) for task in TASKS},
         "ee-task": ee_task_table(),
+        "objects": objects_table(),
         "fine-tuning": fine_tuning_table(),
         "pybullet": pybullet_table(),
         **{f"robots-{name}": curve_table(name) for name in CURVE["VARIANTS"]},
