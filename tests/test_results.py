@@ -65,7 +65,7 @@ def test_the_docs_have_the_numbers_of_a_stored_study(command, copied, monkeypatc
     rows = json.loads((copied / study / "results.json").read_text("utf-8"))["rows"]
     means = {
         (row["split"], row["task"], row["method"]): {
-            f"{side['mean']:{'.0%' if row['task'] == 'push' else '.1f'}}"
+            f"{side['mean']:{'.1f' if row['task'] == 'reach' else '.0%'}}"
             for side in row["sides"].values()
         }
         for row in rows
@@ -111,7 +111,7 @@ def test_the_docs_have_the_constants_of_the_stored_runs():
         ]
         values = tuple(float(constants[key]) for key in CONSTANTS)
         stored.setdefault(name, set()).add(values)
-    text = (ROOT / "docs/training.md").read_text("utf-8")
+    text = (ROOT / "results/README.md").read_text("utf-8")
     number = r"([\d.,e-]*\d)"
     documented = {
         name: {
