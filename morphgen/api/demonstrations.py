@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from morphgen.api.training import named_source, with_goal
 from morphgen.arguments import checked_signature, path_argument, require_types, whole_number
 from morphgen.benchmark.demonstrations import Verification, changed_files, describe
-from morphgen.errors import TaskError
+from morphgen.errors import MorphgenError, TaskError
 from morphgen.grammar.library import LibraryFolders, library_folders
 from morphgen.rl.demonstrations.reader import Demonstrations
 from morphgen.rl.demonstrations.recording import PLANNER, RecordingConfig
@@ -140,6 +140,13 @@ def _sources(given: SimpleNamespace) -> tuple[Source, ...]:
         )
     if not given.tasks:
         return (other_side(named_source(given), given.on),)
+    try:
+        source: Source | None = named_source(given)
+    except MorphgenError:  # a robot alone, as it should be
+        source = None
+    if source is not None:
+        own = ", ".join(tasks_of(source))
+        raise TaskError(f"tasks {', '.join(given.tasks)}: {given.robots} has its own: {own}")
     words = [
         SimpleNamespace(**vars(given) | {"robots": f"{given.robots} task={task}"})
         for task in given.tasks

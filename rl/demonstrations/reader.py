@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,13 +14,15 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
+from morphgen.encoding.robot_hash import HASH_LENGTH
 from morphgen.encoding.tokens import default_max_links
-from morphgen.errors import FormatError, TaskError
+from morphgen.errors import FormatError, TaskError, one_line
 from morphgen.formats.data_files import read_json
 from morphgen.model.robot import Robot
 from morphgen.rl.demonstrations.lerobot import (
     BODIES,
     FORMAT,
+    INDEX,
     INFO,
     RECORDING,
     read_columns,
@@ -71,6 +74,7 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
         settings: Content of ``recording.json``.
         episodes: The episodes, in order.
         columns: All steps by feature.
+        robot_hashes: Hashes of the robots, which ``robot_index`` refers to.
     """
 
     def __init__(self, path: str | PathLike[str]) -> None:
@@ -85,23 +89,28 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
             begun = (self.folder / RECORDING).is_file()
             why = "not finished: run morphgen record again" if begun else f"it has no {INFO}"
             raise FormatError(f"{self.folder} is no data set: {why}")
-        self.settings: dict[str, Any] = read_json(self.folder / RECORDING)
-        if self.settings.get("format") != FORMAT:
-            raise FormatError(
-                f"{self.folder / RECORDING}: format {self.settings.get('format')!r}; this version "
-                f"reads {FORMAT}"
+        try:
+            self.settings: dict[str, Any] = read_json(self.folder / RECORDING)
+            if self.settings["format"] != FORMAT:
+                raise ValueError(f"format {self.settings['format']!r}; this version reads {FORMAT}")
+            self.columns = {
+                name: torch.from_numpy(np.array(values))
+                for name, values in read_columns(self.folder)
+            }
+            self.episodes = tuple(
+                RecordedEpisode(
+                    row["episode_index"],
+                    first=row["dataset_from_index"],
+                    **{name: row[name] for name in _OF_ROW},
+                )
+                for row in read_episodes(self.folder)
             )
-        self.columns = {
-            name: torch.from_numpy(np.array(values)) for name, values in read_columns(self.folder)
-        }
-        self.episodes = tuple(
-            RecordedEpisode(
-                row["episode_index"],
-                first=row["dataset_from_index"],
-                **{name: row[name] for name in _OF_ROW},
-            )
-            for row in read_episodes(self.folder)
-        )
+            self.robot_hashes = tuple(body["robot_hash"] for body in read_index(self.folder))
+            if not all(map(_HASH.fullmatch, self.robot_hashes)):  # they name folders
+                raise ValueError(f"{INDEX}: expected hashes of {HASH_LENGTH} hexadecimal digits")
+        except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+            why = one_line(str(error))
+            raise FormatError(f"{self.folder} is no sound data set: {why}") from error
         self._tables: dict[int, RobotTables] = {}
 
     def __len__(self) -> int:
@@ -115,11 +124,6 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
     def __getitems__(self, frames: Sequence[int]) -> list[dict[str, torch.Tensor]]:
         """Return the features of several steps, as ``DataLoader`` asks for them."""
         return [self[frame] for frame in frames]
-
-    @cached_property
-    def robot_hashes(self) -> tuple[str, ...]:
-        """Hashes of the robots, which ``robot_index`` refers to."""
-        return tuple(body["robot_hash"] for body in read_index(self.folder))
 
     @cached_property
     def robots(self) -> tuple[Robot, ...]:
@@ -205,6 +209,7 @@ _OBSERVED = (
     *("observation.object_pose", "normalized_action", "episode_index", "frame_index"),
 )
 """Features that observations and labels are computed from."""
+_HASH = re.compile(f"[0-9a-f]{{{HASH_LENGTH}}}")
 _OF_ROW = (
     *("robot_index", "robot_hash", "task", "policy", "seed", "success", "score", "distance"),
     "length",

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -58,6 +58,7 @@ from morphgen.rl.runs.robot_source import (
     draw,
     identity,
     members,
+    tasks_of,
 )
 from morphgen.splits.split import Member, compose_member
 from morphgen.tasks.actions import encode_actions
@@ -192,19 +193,23 @@ def record(folder: Path, config: RecordingConfig, *, jobs: int = 1, ray: str | N
     require_pyarrow()
     require_cameras(config.cameras, depth=config.depth)
     require_writable_folder(folder)
-    robots = robots_of(config, jobs)
-    tasks = tuple(dict.fromkeys(task for robot in robots for task, _ in robot.tasks))
+    tasks = tuple(dict.fromkeys(task for source in config.sources for task in tasks_of(source)))
     for task in tasks:
         read_controller(config.policy_for(task), task)  # raises if the policy is not for the task
-    _begin(folder, config.as_data(tasks))
+    settings = config.as_data(tasks)
     if (folder / INFO).is_file():
+        _begin(folder, settings)  # raises if they are not those of the folder
         return folder
+    robots = robots_of(config, jobs)
+    _begin(folder, settings)
     with locked_folder(folder):
         missing = [robot for robot in robots if not _shard(folder, robot).is_file()]
-        work = partial(record_robot, folder.resolve(), replace(config, sources=()))
+        own, place = replace(config, sources=()), folder.resolve()
         with stage("recording"):
             run = (
-                parallel_map(work, missing, jobs, 1) if ray is None else _on_ray(ray, work, missing)
+                parallel_map(partial(record_robot, place, own), missing, jobs, 1)
+                if ray is None
+                else _on_ray(ray, place, own, missing)
             )
             for _ in run:
                 pass
@@ -245,14 +250,14 @@ def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
 
 
 def _on_ray(
-    address: str, work: Callable[[RecordedRobot], int], robots: Sequence[RecordedRobot]
+    address: str, folder: Path, config: RecordingConfig, robots: Sequence[RecordedRobot]
 ) -> Iterator[int]:
     """Record robots as tasks of a Ray cluster, whose machines share the folder."""
     ray = require_ray()
     try:
         with ray_cluster(address or None):
-            remote = ray.remote(num_cpus=1)(work)
-            running = [remote.remote(robot) for robot in robots]
+            remote = ray.remote(num_cpus=1)(record_robot)
+            running = [remote.remote(folder, config, robot) for robot in robots]
             while running:
                 (done, *_), running = ray.wait(running)
                 yield ray.get(done)

@@ -153,6 +153,25 @@ def test_items_are_steps_that_a_data_loader_collates(demos):
     assert len(loader.dataset) == sum(episode.length for episode in demos.episodes)
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "match"),
+    [
+        ("recording.json", '{"format": 9}', "format 9; this version reads 1"),
+        ("recording.json", "[]", "no sound data set"),
+        ("bodies/index.jsonl", '{"robot_hash": "../../mine"}', "32 hexadecimal digits"),
+        ("data/chunk-000/file-000.parquet", "PAR1", "no sound data set"),
+        ("meta/episodes/chunk-000/file-000.parquet", "", "no sound data set"),
+    ],
+)
+def test_damaged_files_are_one_clear_error(folder, tmp_path, name, text, match):
+    copy = tmp_path / "demos"
+    shutil.copytree(folder, copy)
+    (copy / name).write_text(text)
+    with pytest.raises(FormatError, match=match) as caught:
+        morphgen.demos(copy)
+    assert "\n" not in str(caught.value)
+
+
 def test_the_channel_ik_is_refused(demos):
     with pytest.raises(TaskError, match="'ik' depends on earlier steps"):
         demos.observe([0], ObservationConfig(ik=True))
@@ -176,6 +195,13 @@ def test_an_interrupted_recording_continues_to_the_same_bytes(folder, tmp_path, 
     monkeypatch.undo()
     record(copy, once)
     assert folder_hashes(copy) == folder_hashes(folder)
+
+
+@pytest.mark.slow
+def test_ray_gives_the_same_bytes(folder, tmp_path):
+    pytest.importorskip("ray")
+    record(tmp_path / "demos", config(noise=0.2), ray="")
+    assert folder_hashes(tmp_path / "demos") == folder_hashes(folder)
 
 
 @pytest.mark.slow
@@ -203,6 +229,7 @@ def test_a_folder_of_something_else_is_refused(folder, tmp_path):
         ({}, "either robots"),
         ({"drawn": "prims"}, "is not a grammar and a number"),
         ({"drawn": "prims:1", "sim": "best"}, "unknown simulator 'best'"),
+        ({"robots": "interpolation/arm3/reach", "tasks": ["reach"]}, "has its own: reach"),
         ({"drawn": "prims:1", "cameras": ["back"]}, "unknown camera 'back'"),
         ({"drawn": "prims:1", "depth": True}, "depth: only with cameras"),
     ],
