@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -54,60 +53,13 @@ JOINTS = {
 }
 """Features with a number per joint, and their arrays in shards."""
 _POSE = ["x", "y", "z", "qw", "qx", "qy", "qz"]
-_INDICES = ("joint_count", "robot_index", "frame_index", "episode_index", "index", "task_index")
+STATE = "observation.environment_state"
 
 
 def require_pyarrow() -> None:
     """Require the optional package that reads and writes Parquet."""
     with explain_missing_extras("demos"):
         import pyarrow.parquet  # noqa: F401
-
-
-@dataclass(frozen=True)
-class _Feature:
-    """A feature of the format."""
-
-    dtype: str
-    names: list[str] | None = None
-    """Names of its numbers; None for one number."""
-
-    def as_data(self) -> dict[str, Any]:
-        return {"dtype": self.dtype, "shape": [len(self.names or "1")], "names": self.names}
-
-    @property
-    def column(self) -> pyarrow.DataType:
-        """Type of its column."""
-        import pyarrow as pa
-
-        kind = {"float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_()}[self.dtype]
-        return kind if self.names is None else pa.list_(kind, len(self.names))
-
-
-def _features(
-    tasks: Sequence[str], num_joints: int, *, noisy: bool
-) -> tuple[dict[str, _Feature], dict[str, slice]]:
-    """Return the features by name, and where fields of tasks are in the environment's state."""
-    sizes = {field.name: field.size for task in tasks for field in TASKS[task].fields}
-    fields: dict[str, slice] = {}
-    state: list[str] = []
-    for name, size in sizes.items():
-        fields[name] = slice(len(state), len(state) + size)
-        state += [f"{name}_{i}" for i in range(size)]
-    joints = [f"joint_{i}" for i in range(num_joints)]
-    features = {name: _Feature("float32", joints) for name in JOINTS}
-    if not noisy:
-        del features["executed_action"]
-    return {
-        **features,
-        "observation.tool_pose": _Feature("float32", _POSE),
-        "observation.object_pose": _Feature("float32", _POSE),
-        "observation.environment_state": _Feature("float32", state),
-        "next.reward": _Feature("float32"),
-        "next.success": _Feature("bool"),
-        "next.done": _Feature("bool"),
-        "timestamp": _Feature("float32"),
-        **{name: _Feature("int64") for name in _INDICES},
-    }, fields
 
 
 def read_shard(path: Path) -> tuple[list[dict[str, Any]], Arrays]:
@@ -140,10 +92,11 @@ def assemble(
 
     bodies = [read_json(folder / BODIES / robot / BODY) for robot in shards]
     dofs = [len(body["joints"]) for body in bodies]
-    settings = read_json(folder / RECORDING)
-    features, fields = _features(tasks, max(dofs), noisy=settings["noise"] > 0)
-    columns = [(name, feature.column) for name, feature in features.items()]
-    schema = pa.schema(columns)
+    sizes = {field.name: field.size for task in tasks for field in TASKS[task].fields}
+    names = {feature: [f"joint_{i}" for i in range(max(dofs))] for feature in JOINTS}
+    names |= {"observation.tool_pose": _POSE, "observation.object_pose": _POSE}
+    names[STATE] = [f"{name}_{i}" for name, size in sizes.items() for i in range(size)]
+    features: dict[str, Any] = {}
     rows: list[dict[str, Any]] = []
     num_frames = file_index = num_videos = 0
     writer = None
@@ -152,47 +105,33 @@ def assemble(
         episodes, arrays = read_shard(shard)
         if not episodes:
             continue
+        columns = _columns(arrays, max(dofs), sizes)
+        columns |= _index_columns(episodes, tasks, first_frame=num_frames, first_episode=len(rows))
+        columns["joint_count"] = np.full(len(columns["index"]), dofs[robot_index])
+        columns["robot_index"] = np.full(len(columns["index"]), robot_index)
+        table = pa.table({name: _array(values) for name, values in columns.items()})
         if writer is None:
             path = folder / DATA_PATH.format(**_place(file_index))
             path.parent.mkdir(parents=True, exist_ok=True)
-            writer = pq.ParquetWriter(
-                path, schema, compression="zstd", use_dictionary=False, use_byte_stream_split=False
-            )
-        lengths = [episode["length"] for episode in episodes]
-        tables = _columns(arrays, lengths, features, fields)
-        tables["joint_count"] = np.full(sum(lengths), dofs[robot_index])
-        tables["robot_index"] = np.full(sum(lengths), robot_index)
-        tables["index"] = num_frames + np.arange(sum(lengths))
-        tables["episode_index"] = len(rows) + np.repeat(np.arange(len(lengths)), lengths)
-        tables["task_index"] = np.repeat([tasks.index(e["task"]) for e in episodes], lengths)
-        writer.write_table(pa.table([_array(tables[n], t) for n, t in columns], schema=schema))
-        for episode, start in zip(episodes, np.cumsum([0, *lengths]).tolist(), strict=False):
-            length, shown = episode.pop("length"), episode.pop("videos", {})
-            own = {name: values[start : start + length] for name, values in tables.items()}
-            rows.append(
-                {
-                    "episode_index": len(rows),
-                    "tasks": [episode["task"]],
-                    "length": length,
-                    **{f"data/{key}": value for key, value in _place(file_index).items()},
-                    "dataset_from_index": num_frames + start,
-                    "dataset_to_index": num_frames + start + length,
-                    "meta/episodes/chunk_index": 0,
-                    "meta/episodes/file_index": 0,
-                    "robot_hash": robot,
-                    "robot_index": robot_index,
-                    "joint_count": dofs[robot_index],
-                    **episode,
-                    **_statistics(own),
-                    **_video_columns(shown, length, num_videos),
-                }
-            )
+            writer = pq.ParquetWriter(path, table.schema, compression="zstd", use_dictionary=False)
+        writer.write_table(table)
+        features = {
+            name: {
+                "dtype": str(values.dtype),
+                "shape": [*values.shape[1:]] or [1],
+                "names": names.get(name),
+            }
+            for name, values in columns.items()
+        }
+        facts: dict[str, Any] = {f"data/{key}": value for key, value in _place(file_index).items()}
+        facts |= {"robot_hash": robot, "robot_index": robot_index, "joint_count": dofs[robot_index]}
+        rows += _episode_rows(episodes, columns, facts, num_videos)
         for name in videos:
             target = folder / VIDEO_PATH.format(video_key=name, **_place(num_videos))
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(video_path(shard, name), target)
         num_videos += 1
-        num_frames += sum(lengths)
+        num_frames += len(table)
         if path.stat().st_size > DATA_MB * 2**20:
             writer.close()
             writer, file_index = None, file_index + 1
@@ -201,8 +140,8 @@ def assemble(
     if writer is not None:
         writer.close()
     _write_meta(folder, rows, [*features, *videos], tasks)
-    names = ("robot_hash", "name", "category", "derivation", "licences")
-    index = [{name: body[name] for name in names} | {"dof": len(body["joints"])} for body in bodies]
+    kept = ("robot_hash", "name", "category", "derivation", "licences")
+    index = [{name: body[name] for name in kept} | {"dof": len(body["joints"])} for body in bodies]
     write_cache_file(folder / INDEX, "".join(f"{json.dumps(row)}\n" for row in index))
     info = {
         "codebase_version": VERSION,
@@ -217,9 +156,54 @@ def assemble(
         "splits": {"train": f"0:{len(rows)}"},
         "data_path": DATA_PATH,
         "video_path": VIDEO_PATH if videos else None,
-        "features": {name: feature.as_data() for name, feature in features.items()} | dict(videos),
+        "features": features | dict(videos),
     }
     _write_json(folder / INFO, info)
+
+
+def _index_columns(
+    episodes: Sequence[Mapping[str, Any]],
+    tasks: Sequence[str],
+    *,
+    first_frame: int,
+    first_episode: int,
+) -> Arrays:
+    """Return the columns of a shard that its place in the data set determines."""
+    lengths = [episode["length"] for episode in episodes]
+    frame = np.concatenate([np.arange(length) for length in lengths])
+    return {
+        "frame_index": frame,
+        "timestamp": (frame / FPS).astype(np.float32),
+        "index": first_frame + np.arange(len(frame)),
+        "episode_index": first_episode + np.repeat(np.arange(len(lengths)), lengths),
+        "task_index": np.repeat([tasks.index(each["task"]) for each in episodes], lengths),
+    }
+
+
+def _episode_rows(
+    episodes: Sequence[Mapping[str, Any]],
+    columns: Arrays,
+    facts: Mapping[str, Any],
+    video_index: int,
+) -> Iterator[dict[str, Any]]:
+    """Yield the row of each episode of a shard."""
+    start = 0
+    for episode in episodes:
+        length = episode["length"]
+        own = {name: values[start : start + length] for name, values in columns.items()}
+        yield {
+            "episode_index": int(own["episode_index"][0]),
+            "tasks": [episode["task"]],
+            "dataset_from_index": int(own["index"][0]),
+            "dataset_to_index": int(own["index"][-1]) + 1,
+            "meta/episodes/chunk_index": 0,
+            "meta/episodes/file_index": 0,
+            **facts,
+            **{key: value for key, value in episode.items() if key != "videos"},
+            **_statistics(own),
+            **_video_columns(episode.get("videos", {}), length, video_index),
+        }
+        start += length
 
 
 def _place(file_index: int) -> dict[str, int]:
@@ -227,40 +211,36 @@ def _place(file_index: int) -> dict[str, int]:
     return {"chunk_index": file_index // CHUNKS_SIZE, "file_index": file_index % CHUNKS_SIZE}
 
 
-def _columns(
-    arrays: Arrays,
-    lengths: Sequence[int],
-    features: Mapping[str, _Feature],
-    fields: Mapping[str, slice],
-) -> Arrays:
-    """Return the columns of a shard by feature, without those that its place determines."""
-    n = sum(lengths)
+def _columns(arrays: Arrays, num_joints: int, sizes: Mapping[str, int]) -> Arrays:
+    """Return the columns of a shard by feature, without those that its place determines.
+
+    Args:
+        arrays: Arrays of the shard.
+        num_joints: Joints of the largest robot.
+        sizes: Sizes of the observation fields of all tasks.
+    """
     columns: Arrays = {}
     for name, source in JOINTS.items():
-        if name in features:
-            values = arrays[source]
-            columns[name] = np.zeros((n, len(features[name].names or ())), np.float32)
-            columns[name][:, : values.shape[1]] = values
+        if source in arrays:  # the last one only with noise
+            padding = (0, 0), (0, num_joints - arrays[source].shape[1])
+            columns[name] = np.pad(arrays[source], padding)
     for name in ("tool_pose", "object_pose"):
         columns[f"observation.{name}"] = arrays[name]
-    size = len(features["observation.environment_state"].names or ())
-    state = columns["observation.environment_state"] = np.zeros((n, size), np.float32)
-    for name, place in fields.items():
-        if f"field.{name}" in arrays:
-            state[:, place] = arrays[f"field.{name}"]
-    columns |= {f"next.{name}": arrays[name] for name in ("reward", "success", "done")}
-    columns["frame_index"] = np.concatenate([np.arange(length) for length in lengths])
-    columns["timestamp"] = (columns["frame_index"] / FPS).astype(np.float32)
-    return columns
+    n = len(arrays["reward"])
+    fields = [
+        arrays.get(f"field.{k}", np.zeros((n, size), np.float32)) for k, size in sizes.items()
+    ]
+    columns[STATE] = np.concatenate(fields, axis=1)
+    return columns | {f"next.{name}": arrays[name] for name in ("reward", "success", "done")}
 
 
-def _array(values: NDArray[Any], kind: pyarrow.DataType) -> pyarrow.Array:
+def _array(values: NDArray[Any]) -> pyarrow.Array:
     import pyarrow as pa
 
     if values.ndim == 1:
-        return pa.array(values, kind)
-    flat = pa.array(np.ascontiguousarray(values).reshape(-1), kind.value_type)
-    return pa.FixedSizeListArray.from_arrays(flat, kind.list_size)
+        return pa.array(values)
+    flat = pa.array(np.ascontiguousarray(values).reshape(-1))
+    return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
 
 def moments(values: NDArray[np.float64]) -> Arrays:
