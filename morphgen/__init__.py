@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from morphgen import tasks as tasks
     from morphgen.api.benchmark import similarity, tokens
     from morphgen.api.checks import check, conform, fix
-    from morphgen.api.demonstrations import demos, record, verify
+    from morphgen.api.demonstrations import clone, demos, record, verify
     from morphgen.api.environments import make_env
     from morphgen.api.evaluation import evaluate, play
     from morphgen.api.export import export
@@ -33,6 +33,7 @@ __all__ = [
     "Robot",
     "__version__",
     "check",
+    "clone",
     "compose",
     "conform",
     "demos",
@@ -58,6 +59,7 @@ _MODULES = {
     "MorphgenError": "morphgen.errors",
     "Robot": "morphgen.model.robot",
     "check": "morphgen.api.checks",
+    "clone": "morphgen.api.demonstrations",
     "compose": "morphgen.api.robots",
     "conform": "morphgen.api.checks",
     "demos": "morphgen.api.demonstrations",

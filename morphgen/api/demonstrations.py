@@ -1,26 +1,41 @@
-"""Record demonstrations, read them, and verify them in the simulator."""
+"""Record demonstrations, read them, verify them in the simulator, and learn from them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
+from pathlib import Path
 from types import SimpleNamespace
 
-from morphgen.api.training import named_source, with_goal
+from morphgen.api.training import (
+    TrainingRun,
+    folder_name,
+    named_source,
+    run_config,
+    train_run,
+    with_goal,
+)
 from morphgen.arguments import checked_signature, path_argument, require_types, whole_number
 from morphgen.benchmark.demonstrations import Verification, changed_files, describe
+from morphgen.encoding.tokens import default_max_links
 from morphgen.errors import MorphgenError, TaskError
 from morphgen.grammar.library import LibraryFolders, library_folders
+from morphgen.rl.agents import AGENTS
+from morphgen.rl.config import AgentSpec, parse_agent
+from morphgen.rl.demonstrations.cloning import data_sets, recorded_source
+from morphgen.rl.demonstrations.dagger import read_planner, record_states
 from morphgen.rl.demonstrations.reader import Demonstrations
 from morphgen.rl.demonstrations.recording import PLANNER, RecordingConfig
 from morphgen.rl.demonstrations.recording import record as record_episodes
 from morphgen.rl.demonstrations.replay import choose_episodes, replay
 from morphgen.rl.inference import read_controller
+from morphgen.rl.runs.checkpoint import CHECKPOINT, RunConfig
 from morphgen.rl.runs.robot_source import Source, drawn_source, other_side, tasks_of
+from morphgen.rl.runs.training import ShowMetrics, Subrun
 from morphgen.splits.split import Side, require_side
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
-from morphgen.tasks.scenes.env_specs import GoalConfig
+from morphgen.tasks.scenes.env_specs import GoalConfig, task_configs
 
 
 @checked_signature
@@ -199,3 +214,128 @@ def verify(path: str | PathLike[str], *, episodes: int = 10, seed: int = 0) -> V
     data = demos(path)
     replays = tuple(replay(data, choose_episodes(data, count, seed)))
     return Verification(replays, changed_files(data.folder))
+
+
+@checked_signature
+def clone(
+    demonstrations: str | PathLike[str] | Sequence[str | PathLike[str]],
+    *,
+    agent: str = "me-graph",
+    preset: str | None = None,
+    epochs: float = 20.0,
+    minibatch: int = 1024,
+    dagger: str | None = None,
+    rounds: int = 3,
+    episodes: int = 5,
+    device: str = "cpu",
+    seed: int = 0,
+    out: str | PathLike[str] | None = None,
+    resume: bool = False,
+    minutes: int | None = None,
+    jobs: int = 1,
+    constants: Mapping[str, float] | Sequence[str] = (),
+    tensorboard: bool = True,
+    wandb: bool = False,
+    show: Callable[[Subrun], ShowMetrics] | None = None,
+) -> TrainingRun:
+    """Learn the actions of demonstrations: behaviour cloning, and DAgger.
+
+    The run is one of training, whose updates are gradient steps. The critic learns the discounted
+    rewards, so that ``train`` can go on from the policy. With ``dagger`` the policy then acts with
+    the robots of the first data set, a planner says what it would have done in each state, and the
+    policy learns from these steps, too; as often as ``rounds`` says.
+
+    Examples:
+        >>> demos = morphgen.record("prims", tasks=["reach"], episodes=2)
+        >>> run = morphgen.clone("demos", epochs=1)
+        >>> print(run)
+        runs/demos-clone/me-graph/seed0/checkpoint.pt
+
+    Args:
+        demonstrations: Folder of a data set of ``record``, or several.
+        agent: ``me-mlp``, ``me-tf`` or ``me-graph``, with switches as in ``train``.
+        preset: Constants and switches to begin with: ``fast`` or ``paper``; by default the agent's.
+        epochs: Passes over all steps, in each round.
+        minibatch: Number of steps of a gradient step.
+        dagger: A baseline such as ``scripted`` or ``ik`` that labels the states which the policy
+            leads to; ``scripted`` is the best baseline of each task.
+        rounds: Number of rounds of ``dagger``.
+        episodes: Number of episodes of each robot at each task in a round.
+        device: Device of the networks: ``cpu`` or ``cuda``.
+        seed: Seed of weights, minibatches and episodes.
+        out: Folder of the run, by default ``runs/NAME-clone/AGENT/seedN``; with ``dagger`` the runs
+            and data sets of the rounds are inside, and the last run is in ``roundN``.
+        resume: Whether to continue the run in the folder.
+        minutes: Stop with a checkpoint after the update in which so many minutes are over.
+        jobs: Number of processes that record the episodes of ``dagger``.
+        constants: Hyperparameters, such as ``{"learning_rate": 1e-4}``, or ``NAME=VALUE`` texts.
+        tensorboard: Whether to write TensorBoard events.
+        wandb: Whether to also log metrics to Weights & Biases.
+        show: As in ``train``.
+
+    Returns:
+        The folder of the run, and its checkpoint.
+
+    Raises:
+        TaskError: If an argument is invalid, or the folder has another run.
+        FormatError: If a folder is no complete data set of ``record``.
+    """
+    given = SimpleNamespace(**locals())
+    least = {"minibatch": 1, "rounds": 1, "episodes": 1, "jobs": 1, "minutes": 1, "seed": 0}
+    require_types(given, TaskError, "agent", "preset", "dagger", "device", **least)
+    if not 0 < epochs <= MAX_EPOCHS:
+        raise TaskError(f"epochs {epochs}: expected more than 0, and at most {MAX_EPOCHS:,}")
+    if isinstance(demonstrations, str | PathLike):
+        demonstrations = [demonstrations]
+    folders = [Path(each) for each in demonstrations]
+    spec = parse_agent(agent)
+    if AGENTS[spec.agent].per_robot:
+        raise TaskError(f"agent {spec.agent}: learns one robot; expected an agent of many")
+    data = data_sets(folders)
+    name = folder_name(recorded_source(data)) if len(data) > 1 else data[0].folder.resolve().name
+    folder = Path(out or Path("runs") / f"{name}-clone" / str(spec) / f"seed{seed}")
+    if dagger is None:
+        return train_run(folder, _cloning_config(data, spec, given), given)
+    read_planner(dagger, tasks_of(recorded_source(data)))
+    given.resume = given.resume or not folder.exists()
+    run = train_run(folder / "round0", _cloning_config(data, spec, given), given)
+    for number in range(1, rounds + 1):
+        if run.unfinished:
+            return run
+        states = record_states(
+            data[0],
+            folder / f"demos{number}",
+            run.folder,
+            dagger,
+            episodes=episodes,
+            seed=seed + number,
+            jobs=jobs,
+        )
+        data = [*data, *data_sets([states])]
+        config = replace(
+            _cloning_config(data, spec, given),
+            initial_checkpoint=f"../round{number - 1}/{CHECKPOINT}",
+        )
+        run = train_run(folder / f"round{number}", config, given)
+    return run
+
+
+MAX_EPOCHS = 100_000
+"""Most passes over the steps of demonstrations."""
+
+
+def _cloning_config(
+    data: Sequence[Demonstrations], spec: AgentSpec, given: SimpleNamespace
+) -> RunConfig:
+    """Return the configuration of a run that learns from data sets."""
+    source, steps = recorded_source(data), sum(map(len, data))
+    words = {"steps": max(round(given.epochs * steps), given.minibatch), "envs": given.minibatch}
+    words |= {"sim": data[0].settings["sim"], "geometry": "primitive", "whole": False, "goal": None}
+    words |= {"bf16": False, "compile": False, "train_goals": None}
+    links = default_max_links(len(robot.links) for each in data for robot in each.robots)
+    options = SimpleNamespace(**vars(given) | words | {"max_links": links})
+    config = run_config(source, spec, options)
+    ppo = replace(config.ppo, num_steps=1, epochs=1, minibatches=1, curriculum=False)
+    own = {task.task: task for task in task_configs(data[0].settings["constants"])}
+    tasks = tuple(own.get(task.task, task) for task in config.tasks)
+    return replace(config, ppo=ppo, tasks=tasks)

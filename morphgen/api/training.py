@@ -18,12 +18,13 @@ from morphgen.errors import BenchmarkError, TaskError
 from morphgen.grammar.library import LibraryFolders, library_folders
 from morphgen.processes import usable_cores
 from morphgen.progress import note
-from morphgen.rl.agents import AGENTS, preset_of
+from morphgen.rl.agents import AGENTS, ME_GRAPH, preset_of
 from morphgen.rl.config import AgentSpec, configs_of, owners_of, parse_agent, parse_constants
-from morphgen.rl.runs.checkpoint import CHECKPOINT, CONFIG, RunConfig, read_config
+from morphgen.rl.runs.checkpoint import CHECKPOINT, CONFIG, RunConfig, read_checkpoint, read_config
 from morphgen.rl.runs.robot_source import (
     GrammarSource,
     OneRobot,
+    RecordedSource,
     Source,
     SplitSource,
     draw,
@@ -40,12 +41,14 @@ from morphgen.rl.runs.training import (
     ExecutionConfig,
     ShowMetrics,
     Subrun,
+    checkpoint_files,
     default_slice_updates,
     is_done,
     num_slices,
     require_runnable,
 )
 from morphgen.rl.runs.training import train as train_parts
+from morphgen.rl.shipped_policies import checkpoint_path
 from morphgen.splits.split import Side, require_side
 from morphgen.splits.split_file import read_split
 from morphgen.tasks.goals.split_goals import has_goals, read_split_goals
@@ -110,6 +113,7 @@ def train(
     robot_seed: int | None = None,
     held_out: Sequence[str | Path] = (),
     slice_updates: int | None = None,
+    initial: str | PathLike[str] | None = None,
     constants: Mapping[str, float] | Sequence[str] = (),
     tensorboard: bool = True,
     wandb: bool = False,
@@ -161,6 +165,8 @@ def train(
         held_out: Splits whose test robots are never drawn, besides those of morphgen.
         slice_updates: Number of updates after which the next of the drawn robots take the
             environments, if there are fewer of these; by default those of two episodes.
+        initial: A checkpoint, a run folder or a policy that comes with morphgen, whose networks
+            the run begins with.
         constants: Hyperparameters, such as ``{"learning_rate": 1e-4}``, or ``NAME=VALUE`` texts.
         tensorboard: Whether to write TensorBoard events.
         wandb: Whether to also log metrics to Weights & Biases.
@@ -197,18 +203,35 @@ def train(
     else:
         source = _source_to_draw(given)
     # Positions came first and have no suffix.
-    name = _folder_name(source) + "-pose" * (goal == "pose")
+    name = folder_name(source) + "-pose" * (goal == "pose")
     folder = Path(out) if out is not None else Path("runs") / name / str(spec) / f"seed{seed}"
     if resumed := resumed_config(folder, resume=resume):
         given.steps = steps or resumed.ppo.total_timesteps
         given.envs = envs or resumed.num_envs
         given.sim = sim or resumed.sim
-    config = run_config(source, spec, given)
+    config = _with_networks_of(initial, agent, run_config(source, spec, given))
     require_simulator_device(config.sim, batch_device(config.sim, device))
     _require_used(config, given)
     if isinstance(source, GrammarSource):
         config = _with_drawn_robots(config, source, given)  # which takes minutes
     return train_run(folder, config, given)
+
+
+def _with_networks_of(
+    initial: str | PathLike[str] | None, agent: str, config: RunConfig
+) -> RunConfig:
+    """Return the configuration of a run that begins with the networks of a checkpoint."""
+    if initial is None:
+        return config
+    if agent != ME_GRAPH.name:
+        raise TaskError(f"agent {agent}: the networks are those of {initial}")
+    (file, *others) = checkpoint_files(
+        checkpoint_path(Path(initial) if isinstance(initial, PathLike) else initial)
+    )
+    if others:
+        raise TaskError(f"{initial} has {len(others) + 1} policies: name one, such as {file}")
+    policy = read_checkpoint(file)[0].policy
+    return replace(config, policy=policy, initial_checkpoint=str(file.resolve()))
 
 
 def resumed_config(folder: Path, *, resume: bool) -> RunConfig | None:
@@ -409,7 +432,7 @@ def _with_drawn_robots(
     return replace(config, source=drawn, max_links=max_links)
 
 
-def _folder_name(source: Source) -> str:
+def folder_name(source: Source) -> str:
     """Return the name of the folder of a run's robots."""
     if isinstance(source, SplitSource):
         name = source.name + "-test" * (source.side == "test")
@@ -420,7 +443,7 @@ def _folder_name(source: Source) -> str:
 
 def train_run(folder: Path, config: RunConfig, given: SimpleNamespace) -> TrainingRun:
     """Say what is trained, and train to the end of the run, or until it is stopped."""
-    workers = given.workers
+    workers = getattr(given, "workers", None)
     if isinstance(config.source, GrammarSource) and not SIMULATORS[config.sim].takes_workers:
         workers = None  # the others have drawn the robots
     begun: list[str] = []
@@ -448,6 +471,12 @@ def train_run(folder: Path, config: RunConfig, given: SimpleNamespace) -> Traini
 def _described(folder: Path, config: RunConfig) -> str:
     """Return in a line what a run trains on what, and where."""
     source, ppo = config.source, config.ppo
+    if isinstance(source, RecordedSource):
+        return (
+            f"cloning {source.name} to {config.policy.agent} at {', '.join(tasks_of(source))}: "
+            f"{config.num_updates:,} gradient steps of {config.num_envs:,} recorded steps, "
+            f"networks on {config.device}; folder {folder}"
+        )
     number = len(members(source)) or num_drawn(source) or 1
     robots = "1 robot" if number == 1 else f"{number} robots"
     return (

@@ -1,4 +1,4 @@
-"""``morphgen record`` and ``morphgen verify``: demonstrations, and their replay."""
+"""``morphgen record``, ``verify`` and ``clone``: demonstrations, and what is learned from them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from dataclasses import asdict
 from morphgen.api import demonstrations
 from morphgen.benchmark.demonstrations import Verification, summarize, summary_text
 from morphgen.cli import options as opt
-from morphgen.cli.progress import bar
+from morphgen.cli.progress import bar, training_progress
+from morphgen.cli.train import RESUME, print_run
 from morphgen.rl.demonstrations.reader import Demonstrations
 from morphgen.rl.demonstrations.replay import TOLERANCE
 from morphgen.tables import table
@@ -38,6 +39,14 @@ def print_summary(args: argparse.Namespace, demos: Demonstrations) -> None:
         f"{data['steps']:,} steps, {size / 1e6:,.1f} MB"
     )
     opt.print_result(args, data, lambda: f"{head}\n{summary_text(demos)}")
+
+
+def clone(args: argparse.Namespace) -> None:
+    """Learn demonstrations and print the path of the checkpoint."""
+    with training_progress(RESUME) as display:
+        given = opt.arguments(args, demonstrations.clone)
+        run = demonstrations.clone(args.words, show=display.training, **given)
+    print_run(run, args.minutes)
 
 
 def verify(args: argparse.Namespace) -> int:

@@ -245,7 +245,7 @@ class TrainingProgress:
 
         A line at its end says how many of its episodes diverged, if any did.
         """
-        from morphgen.rl.runs.robot_source import SplitSource, tasks_of
+        from morphgen.rl.runs.robot_source import RecordedSource, SplitSource, tasks_of
 
         raise_if_interrupted()
         self.close()
@@ -275,6 +275,9 @@ class TrainingProgress:
 
         def update(report: UpdateMetrics, total: int) -> None:
             counts.update(episodes=report.episodes, diverged=report.unstable)
+            if isinstance(source, RecordedSource):  # nothing acts
+                show(report, total, {"loss": f"{report.policy_loss:.3f}"})
+                return
             success = f"{report.success:.0%}" if report.episodes else "unknown"
             show(report, total, {metric: f"{getattr(report, metric):.2f}", "success": success})
 

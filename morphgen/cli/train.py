@@ -47,7 +47,14 @@ from morphgen.rl.config import (
 )
 from morphgen.rl.evaluation import EvalConfig, episodes_for
 from morphgen.rl.runs.checkpoint import RunConfig, read_checkpoint
-from morphgen.rl.runs.robot_source import GrammarSource, OneRobot, Source, other_side, tasks_of
+from morphgen.rl.runs.robot_source import (
+    GrammarSource,
+    OneRobot,
+    RecordedSource,
+    Source,
+    other_side,
+    tasks_of,
+)
 from morphgen.rl.runs.training import (
     ExecutionConfig,
     checkpoint_files,
@@ -93,10 +100,10 @@ def train(args: argparse.Namespace) -> None:
     with training_progress(RESUME) as display:
         given = opt.arguments(args, training.train)
         run = training.train(" ".join(args.words), show=display.training, **given)
-    _print_run(run, args.minutes)
+    print_run(run, args.minutes)
 
 
-def _print_run(run: TrainingRun, minutes: int | None) -> None:
+def print_run(run: TrainingRun, minutes: int | None) -> None:
     """Print the paths of the checkpoints, and say how to go on."""
     if text := str(run):
         print(text)
@@ -117,6 +124,8 @@ def _next_command(run: TrainingRun) -> str:
         program = f"python {shlex.quote(sys.argv[0])}"
     if isinstance(source, GrammarSource):
         return f"score it on fresh robots: {program} eval {shlex.quote(folder)}"
+    if isinstance(source, RecordedSource):
+        return f"score it on other robots: {program} eval {shlex.quote(folder)} --split SPLIT"
     if isinstance(source, OneRobot):
         words = [source.task, source.name, *["--obstacles"] * source.obstacles]
         words += ["--policy", folder, "--sim", run.config.sim]
@@ -142,7 +151,7 @@ def finetune(args: argparse.Namespace) -> None:
     with training_progress(RESUME) as display:
         given = SimpleNamespace(**vars(args), show=display.training)
         run = train_run(folder, _finetuning_config(files[0], folder, args), given)
-    _print_run(run, args.minutes)
+    print_run(run, args.minutes)
 
 
 def _finetuning_config(file: Path, folder: Path, args: argparse.Namespace) -> RunConfig:

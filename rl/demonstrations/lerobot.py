@@ -346,11 +346,16 @@ def read_episodes(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def data_files(folder: Path) -> list[Path]:
+    """Return the files with the steps of a data set."""
+    return sorted((folder / "data").glob("*/*.parquet"))
+
+
 def read_columns(folder: Path) -> Iterator[tuple[str, NDArray[Any]]]:
     """Yield the features of all steps by name: arrays (frames,), or (frames, size)."""
     import pyarrow.parquet as pq
 
-    table = pq.read_table([str(path) for path in sorted((folder / "data").glob("*/*.parquet"))])
+    table = pq.read_table([str(path) for path in data_files(folder)])
     for name in table.column_names:
         column = table[name].combine_chunks()
         values = column.flatten().to_numpy() if hasattr(column.type, "list_size") else None

@@ -172,6 +172,21 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
         Raises:
             TaskError: If observations have the channel ``ik``, which depends on earlier steps.
         """
+        batch, action = self.batch(frames, observe, kind=kind, max_links=max_links)
+        return batch.observe(), action
+
+    def batch(
+        self,
+        frames: Sequence[int] | torch.Tensor,
+        observe: ObservationConfig | None = None,
+        *,
+        kind: ActionKind = "continuous",
+        max_links: int | None = None,
+    ) -> tuple[TaskBatch, torch.Tensor]:
+        """Return environments in the states of n steps, and actions as ``observe`` returns them.
+
+        They cannot be stepped. The arguments are those of ``observe``.
+        """
         if observe is not None and observe.ik:
             raise TaskError(
                 "observation channel 'ik' depends on earlier steps, which data sets do not keep"
@@ -201,7 +216,7 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
         starts = (columns["frame_index"] == 0)[:, None]
         batch.previous_action.copy_(before.masked_fill(starts, 0))
         action = at_links(batch, columns["normalized_action"])
-        return batch.observe(), encode_actions(action, kind)
+        return batch, encode_actions(action, kind)
 
 
 _OBSERVED = (

@@ -78,6 +78,11 @@ _SEED_OFFSET = 0xDE_305
 """Mixed into the seeds of episodes, which thus differ from those of training and evaluation."""
 
 
+def best_of(task: str, policy: str) -> str:
+    """Return a policy's name, or for ``PLANNER`` that of the best baseline of a task."""
+    return baselines_for(task)[0] if policy == PLANNER else policy
+
+
 @dataclass(frozen=True)
 class RecordingConfig:
     """All that determines the episodes of a data set."""
@@ -86,6 +91,9 @@ class RecordingConfig:
     """Robots with their tasks; those of a split have a task each."""
     policy: str = PLANNER
     """A baseline, a shipped policy, a checkpoint, or ``PLANNER``."""
+    teacher: str = ""
+    """Policy whose actions are the labels, in the states that ``policy`` leads to (DAgger: Ross,
+    Gordon and Bagnell 2011); empty for those of ``policy``."""
     episodes: int = 20
     """Number of episodes of each robot at each of its tasks."""
     seed: int = 0
@@ -106,7 +114,7 @@ class RecordingConfig:
 
     def policy_for(self, task: str) -> str:
         """Return the name of the policy at a task."""
-        return baselines_for(task)[0] if self.policy == PLANNER else self.policy
+        return best_of(task, self.policy)
 
     def as_data(self, tasks: Sequence[str]) -> dict[str, Any]:
         """Return the entries of ``recording.json``; they contain no folder of this machine."""
@@ -126,7 +134,7 @@ class RecordingConfig:
         }
 
 
-_KEYS = ("episodes", "seed", "noise", "hold", "only_success", "sim", "cameras", "depth")
+_KEYS = ("teacher", "episodes", "seed", "noise", "hold", "only_success", "sim", "cameras", "depth")
 
 
 def _named(policy: str) -> str:
@@ -171,7 +179,8 @@ def _units(
             of_source = draw(source, config.goals, jobs=jobs).members
     else:
         of_source = members(source)
-        source = replace(source, split="")  # the text of all robots, for which each has its own
+        if isinstance(source, SplitSource):  # the text of all robots, for which each has its own
+            source = replace(source, split="")
     for member in of_source:
         yield (
             member,
@@ -383,9 +392,8 @@ def _record_task(
     seeds = episode_seeds(config.seed, robot, spec.task, config.episodes)
     # A planner takes seconds for a plan, and would plan for every environment whose episode ended
     # before the longest; the networks of a policy take long for each of their calls.
-    num_envs = (
-        1 if TASKS[spec.task].moves_object and controller_spec.learner is None else len(seeds)
-    )
+    planned = controller_spec.learner is None or config.teacher
+    num_envs = 1 if TASKS[spec.task].moves_object and planned else len(seeds)
     simulator = SIMULATORS[config.sim]
     batch = batch_from_specs(
         [spec],
@@ -396,11 +404,14 @@ def _record_task(
         **vars(controller_spec.interface),
     )
     with closing(batch):
-        controller = make_controller(controller_spec, config.seed)
+        controllers = [make_controller(controller_spec, config.seed)]
+        if config.teacher:
+            teacher = read_controller(best_of(spec.task, config.teacher), spec.task)
+            controllers.append(make_controller(teacher, config.seed))
         generator = torch.Generator().manual_seed(seeds[0])
         for first in range(0, len(seeds), num_envs):
             own = seeds[first : first + num_envs]
-            for seed, episode, arrays in _episodes(batch, controller, own, config, generator):
+            for seed, episode, arrays in _episodes(batch, controllers, own, config, generator):
                 if not episode.diverged and (episode.success or not config.only_success):
                     facts = {"task": spec.task, "policy": _named(policy), "seed": seed}
                     facts |= {k: getattr(episode, k) for k in ("success", "score", "distance")}
@@ -410,12 +421,15 @@ def _record_task(
 @one_torch_thread()
 def _run(
     batch: TaskBatch,
-    controller: Controller,
+    controllers: Sequence[Controller],
     seeds: Sequence[int],
     config: RecordingConfig,
     generator: torch.Generator,
 ) -> tuple[EpisodeResults, list[dict[str, torch.Tensor]]]:
-    """Run an episode of every environment; return the results and all steps, (n, ...) each."""
+    """Run an episode of every environment; return the results and all steps, (n, ...) each.
+
+    The first controller acts. The actions of the last one are the labels.
+    """
     noise, hold = config.noise, config.hold
     batch.reset(seed=seeds)
     results = EpisodeResults(batch.num_envs, 1, batch.device)
@@ -423,16 +437,19 @@ def _run(
     while not bool((results.finished > 0).all()):
         values = step_state(batch)
         mask = batch.action_mask
-        action = batch.decode_actions(controller.act(batch), mask.shape).where(mask, 0.0)
-        executed = action
+        acted, *labels = (
+            batch.decode_actions(each.act(batch), mask.shape).where(mask, 0.0)
+            for each in controllers
+        )
+        action, executed = (labels or [acted])[-1], acted
         if noise:
             random = torch.randn(mask.shape, generator=generator).to(action)
-            executed = (action + noise * random).clamp(-1, 1).where(mask, 0.0)
+            executed = (acted + noise * random).clamp(-1, 1).where(mask, 0.0)
         given = encode_actions(executed, batch.action_kind)
         executed = batch.decode_actions(given, mask.shape)
         values["normalized_action"] = at_joints(batch, action)
         values["action"] = commanded_targets(batch, values["normalized_action"])
-        if noise:
+        if noise or labels:
             values["executed_action"] = at_joints(batch, executed)
         step = batch.step(given)
         successes = torch.where(step.success, successes + 1, 0)
@@ -447,13 +464,13 @@ def _run(
 
 def _episodes(
     batch: TaskBatch,
-    controller: Controller,
+    controllers: Sequence[Controller],
     seeds: Sequence[int],
     config: RecordingConfig,
     generator: torch.Generator,
 ) -> Iterator[tuple[int, Any, Arrays]]:
     """Yield the seed and result of an episode of each environment, and its arrays by step."""
-    results, steps = _run(batch, controller, seeds, config, generator)
+    results, steps = _run(batch, controllers, seeds, config, generator)
     stacked = {k: torch.stack([step[k] for step in steps]).cpu().numpy() for k in steps[0]}
     for seed, episode in zip(seeds, results.episodes(batch), strict=True):
         yield seed, episode, {k: v[: episode.steps, episode.env] for k, v in stacked.items()}

@@ -29,6 +29,8 @@ from morphgen.grammar.analysis import load_sound_grammar
 from morphgen.grammar.grammar_file import SUFFIX
 from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_source import is_robot_file
+from morphgen.model.kinematics import driving_joints
+from morphgen.model.robot import TOOL, Robot
 from morphgen.processes import parallel_stream
 from morphgen.progress import own_progress, show_progress
 from morphgen.rl.config import read_fields
@@ -43,6 +45,7 @@ from morphgen.splits.split_file import (
     split_text,
 )
 from morphgen.tasks.goals.split_goals import read_goals, shipped_goal_set
+from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot, member_spec
 from morphgen.tasks.task import EnvSpec, GoalSet
 
@@ -93,10 +96,23 @@ class GrammarSource(_Robots):
     drawn_hash: str = ""  # hash of the drawn robots; empty until they are drawn
 
 
-Source: TypeAlias = SplitSource | OneRobot | GrammarSource
+@dataclass(frozen=True, kw_only=True)
+class RecordedSource(_Robots):
+    """Robots of demonstrations, which a policy learns from without an environment."""
+
+    task: str
+    """Name of the task, or names with commas between them."""
+    obstacles: bool = False
+    demonstrations: tuple[str, ...]
+    """Folders of the data sets."""
+    content: tuple[str, ...]
+    """Hash of the steps of each data set."""
+
+
+Source: TypeAlias = SplitSource | OneRobot | GrammarSource | RecordedSource
 """Robots to train or to evaluate on."""
 S = TypeVar("S", bound=Source)
-KINDS = (SplitSource, GrammarSource, OneRobot)
+KINDS = (SplitSource, GrammarSource, RecordedSource, OneRobot)
 
 
 def source_from(stored: object, where: str) -> Source:
@@ -108,6 +124,8 @@ def source_from(stored: object, where: str) -> Source:
     kind: type[Source] = OneRobot
     if data.get("grammars"):
         kind = GrammarSource
+    elif data.get("demonstrations"):
+        kind = RecordedSource
     elif data.get("task") is None:
         kind = SplitSource
     own, known = (
@@ -203,7 +221,7 @@ def other_side(source: S, side: Side) -> S:
     """Return a whole side of the same split."""
     if isinstance(source, SplitSource):
         return replace(source, side=side, member=None)
-    if side == "test" and isinstance(source, GrammarSource):
+    if side == "test" and isinstance(source, GrammarSource | RecordedSource):
         raise _without_sides(source)
     if side == "test":
         raise TaskError(f"{source.name!r} is one robot and not a split: it has no test robots")
@@ -240,7 +258,7 @@ def require_links(source: Source, max_links: int) -> None:
 
 def specs_of(source: Source, config: GoalConfig) -> list[EnvSpec]:
     """Return the robots with their tasks and scenes; each is built once per process."""
-    if isinstance(source, GrammarSource):
+    if isinstance(source, GrammarSource | RecordedSource):
         raise _without_sides(source)
     config = replace(config, seed=source.goal_seed)
     if isinstance(source, SplitSource):
@@ -259,10 +277,11 @@ def specs_of(source: Source, config: GoalConfig) -> list[EnvSpec]:
     return [env_spec(robot, source.task, config, obstacles=source.obstacles)]
 
 
-def _without_sides(source: GrammarSource) -> TaskError:
+def _without_sides(source: GrammarSource | RecordedSource) -> TaskError:
+    origin = "are drawn from grammars" if isinstance(source, GrammarSource) else "were recorded"
     return TaskError(
-        f"the training robots {source.name} are drawn from grammars and have no test side: name "
-        "other robots with --split"
+        f"the training robots {source.name} {origin} and have no test side: name other robots "
+        "with --split"
     )
 
 
@@ -354,6 +373,13 @@ def drawn_source(
             for split in held_out
         ),
     )
+
+
+def num_actuated(robot: Robot, task: str) -> int:
+    """Return the number of joints that actions move."""
+    if TASKS[task].moves_fingers:
+        return robot.dof
+    return len(driving_joints(robot, robot.joint_chain(robot.frame(TOOL).link)))
 
 
 def num_drawn(source: Source) -> int:

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -25,12 +26,11 @@ from morphgen.files import write_atomic
 from morphgen.formats.data_files import parse_json, read_text
 from morphgen.formats.files import locked_folder, naming
 from morphgen.formats.records import read_record
-from morphgen.model.kinematics import driving_joints
-from morphgen.model.robot import TOOL, Robot
 from morphgen.processes import one_torch_thread
 from morphgen.progress import show_progress
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import PPOConfig, differences, policy_from
+from morphgen.rl.demonstrations.cloning import Cloner, DemonstrationBatches
 from morphgen.rl.distributed import ProcessGroup, UpdateMetrics, process_group
 from morphgen.rl.observation_layout import Layout, last_link, layout_of, require_layout
 from morphgen.rl.ppo import FINETUNING_ACTOR_LR_SCALE, Learner
@@ -47,10 +47,12 @@ from morphgen.rl.runs.checkpoint import (
 )
 from morphgen.rl.runs.robot_source import (
     GrammarSource,
+    RecordedSource,
     Source,
     SplitSource,
     draw,
     members,
+    num_actuated,
     num_drawn,
     require_links,
     specs_of,
@@ -58,7 +60,7 @@ from morphgen.rl.runs.robot_source import (
 )
 from morphgen.rl.scores import finite_or_none
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.registry import TASKS, batch_device, require_device
+from morphgen.tasks.registry import batch_device, require_device
 from morphgen.tasks.scenes.env_specs import GoalConfig
 from morphgen.tasks.scenes.make import batch_from_specs
 
@@ -193,13 +195,6 @@ def slice_of(num_robots: int, size: int, number: int, seed: int) -> list[int]:
     start = first - passes[0] * num_robots
     robots: list[int] = order[start : start + size].tolist()
     return robots
-
-
-def num_actuated(robot: Robot, task: str) -> int:
-    """Return the number of joints that actions move."""
-    if TASKS[task].moves_fingers:
-        return robot.dof
-    return len(driving_joints(robot, robot.joint_chain(robot.frame(TOOL).link)))
 
 
 class TrainingBatches:
@@ -421,9 +416,7 @@ def train(
                     begin()
             envs = processes.share(part.config.num_envs, "--envs")
             with nullcontext() if processes.is_first else show_progress(None):
-                batches = TrainingBatches(
-                    part.config, envs=envs, device=device, workers=execution.workers
-                )
+                batches = _batches(part.config, envs, device, execution.workers)
             with _learner(part, batches, processes, device) as learner:
                 if processes.is_first:
                     if not holds:
@@ -521,16 +514,30 @@ def updates_between(config: RunConfig) -> int:
     return max(min(-(-interval // num_steps), config.num_updates // MIN_CHECKPOINTS), 1)
 
 
+def _batches(
+    config: RunConfig, envs: range, device: str, workers: int | None
+) -> TrainingBatches | DemonstrationBatches:
+    if isinstance(config.source, RecordedSource):
+        return DemonstrationBatches(config)
+    return TrainingBatches(config, envs=envs, device=device, workers=workers)
+
+
 @contextmanager
 def _learner(
-    part: Subrun, batches: TrainingBatches, processes: ProcessGroup, device: str
+    part: Subrun,
+    batches: TrainingBatches | DemonstrationBatches,
+    processes: ProcessGroup,
+    device: str,
 ) -> Iterator[Learner]:
     """Build the learner of a part, and resume its checkpoint if there is one."""
     config, state = part.config, None
     if (part.folder / CHECKPOINT).is_file():
         state = read_checkpoint(part.folder)[1]
+    make: Callable[..., Learner] = Learner
+    if isinstance(batches, DemonstrationBatches):
+        make = partial(Cloner, batches)
     with closing(batches):
-        learner = Learner(
+        learner = make(
             batches.make(state["update"] if state else 0),
             config.policy,
             config.ppo,
@@ -550,7 +557,7 @@ def _learner(
 
 def _learn(
     learner: Learner,
-    batches: TrainingBatches,
+    batches: TrainingBatches | DemonstrationBatches,
     part: Subrun,
     execution: ExecutionConfig | None,
     show: Callable[[Subrun], ShowMetrics] | None,

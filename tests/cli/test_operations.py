@@ -18,6 +18,7 @@ OPERATIONS = {
     "export": ("export", ROBOT, {"root", "json"}),
     "goals": ("goals", ROBOTS, {"json", "wide"}),
     "play": ("play", ROBOT, set()),
+    "clone": ("clone", {"words": "demonstrations"}, set()),
     "record": ("record", ROBOTS, {"json"}),
     "train": ("train", ROBOTS, {*SWITCHES, "observe"}),
     "verify": ("verify", {}, {"json", "wide"}),

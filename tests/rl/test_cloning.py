@@ -1,0 +1,100 @@
+"""Cloning of demonstrations: what is learned, resuming, DAgger, and refusals."""
+
+import json
+
+import pytest
+import torch
+
+import morphgen
+from morphgen.errors import TaskError
+from morphgen.rl.demonstrations.cloning import returns_of
+from morphgen.rl.runs.checkpoint import read_checkpoint
+
+pytest.importorskip("pyarrow")
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    """Return a data set of one robot that reaches."""
+    folder = tmp_path_factory.mktemp("data") / "demos"
+    return morphgen.record("prims", tasks=["reach"], episodes=6, hold=5, out=folder)
+
+
+def test_a_clone_repeats_the_planner(demos, tmp_path):
+    run = morphgen.clone(demos.folder, epochs=100, minibatch=128, out=tmp_path / "run")
+    (score,) = morphgen.evaluate(run.folder, robots="prims task=reach", episodes=20).scores[
+        "deterministic"
+    ]
+    assert score.success > 0.5
+    lines = (run.folder / "metrics.jsonl").read_text("utf-8").splitlines()
+    first, last = (json.loads(line) for line in (lines[0], lines[-1]))
+    assert last["policy_loss"] < first["policy_loss"]
+    assert last["explained_variance"] > 0.5
+
+
+def test_the_same_seed_gives_the_same_weights(demos, tmp_path):
+    runs = [
+        morphgen.clone(demos.folder, epochs=1, minibatch=64, seed=3, out=tmp_path / name)
+        for name in "ab"
+    ]
+    actors = [read_checkpoint(run.folder)[1]["actor"] for run in runs]
+    assert actors[0].keys() == actors[1].keys()
+    assert all(torch.equal(actors[0][name], actors[1][name]) for name in actors[0])
+
+
+def test_returns_are_discounted_to_the_end_of_the_episode(demos):
+    returns, rewards = returns_of(demos, 0.9), demos.columns["next.reward"].flatten()
+    for episode in demos.episodes:
+        last = episode.frames[-1]
+        assert returns[last] == rewards[last]
+        assert returns[last - 1] == pytest.approx(float(rewards[last - 1] + 0.9 * rewards[last]))
+
+
+def test_dagger_labels_the_states_of_the_policy(demos, tmp_path):
+    small = {"epochs": 0.5, "minibatch": 64, "rounds": 1, "episodes": 2}
+    run = morphgen.clone(demos.folder, dagger="jacobian", out=tmp_path / "run", **small)
+    assert run.folder == tmp_path / "run" / "round1"
+    states = morphgen.demos(tmp_path / "run" / "demos1")
+    assert {each.policy for each in states.episodes} == {"round0"}
+    label, executed = states.columns["normalized_action"], states.columns["executed_action"]
+    assert not torch.equal(label, executed)
+    assert run.config.initial_checkpoint.endswith("round0/checkpoint.pt")
+    again = morphgen.clone(
+        demos.folder, dagger="jacobian", out=tmp_path / "run", resume=True, **small
+    )
+    assert again.folder == run.folder
+
+
+def test_training_begins_with_the_networks_of_a_clone(demos, tmp_path):
+    clone = morphgen.clone(demos.folder, epochs=0.5, minibatch=64, out=tmp_path / "clone")
+    steps = {"steps": 256, "envs": 8, "constants": {"num_steps": 32, "minibatches": 2}}
+    run = morphgen.train("prims task=reach", initial=clone.folder, out=tmp_path / "run", **steps)
+    assert run.config.policy == clone.config.policy
+    count = [
+        int(read_checkpoint(each.folder)[1]["actor"]["normalizer.count"]) for each in (clone, run)
+    ]
+    assert count[1] > count[0] > 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"agent": "se"}, "learns one robot"),
+        ({"epochs": 0}, "more than 0"),
+        ({"dagger": "zero-shot"}, "no baseline; valid"),
+        ({"dagger": "nobody"}, "no baseline; valid"),
+    ],
+)
+def test_refusals(demos, tmp_path, changes, message):
+    with pytest.raises(TaskError, match=message):
+        morphgen.clone(demos.folder, out=tmp_path / "run", **changes)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_data_set_that_changed_is_refused(demos, tmp_path):
+    run = morphgen.clone(demos.folder, epochs=0.2, minibatch=64, out=tmp_path / "run")
+    text = (run.folder / "config.json").read_text("utf-8")
+    content = run.config.source.content[0]
+    (run.folder / "config.json").write_text(text.replace(content, "0" * 64), "utf-8")
+    with pytest.raises(TaskError, match="content"):
+        morphgen.clone(demos.folder, epochs=0.2, minibatch=64, out=tmp_path / "run", resume=True)
