@@ -49,7 +49,7 @@ _DEPTH = 0.1  # how far below the object's top the robot must touch it
 _PARTS, _MOVE, _MOVES = 4, 0.05, 5
 """Parts of a track's step in which robots touch the object; how far it moves at a time until they
 do not, and the largest number of such motions in a part."""
-_SURPLUS = 0.3  # motion beyond the goal that a track has to make
+_SURPLUS = 0.1  # motion beyond the goal that a track has to make
 _LEAST_PART = 0.3  # part of the motion that a track has to make
 _UNFINISHED_COST = 400.0  # cost of a track that makes no part of the motion
 _CANDIDATES = 24  # tracks, the cheapest first, to which straight paths are tried
@@ -188,15 +188,10 @@ class MotionPlanner:
             moves[:, point + 1] = moved
         return moves
 
-    def retreat(self, q: Array, track: Array, position: float) -> Array:
-        """Return a configuration free of collisions: q, or the last such one of a track (n, dof).
-
-        Without one it is q.
-        """
-        line = np.concatenate([track, q[None]])
+    def retreat(self, q: Array, track: Array, along: float, position: float) -> Array:
+        """Return a configuration free of collisions: q, or that of a track behind the object."""
         pose = self._thing.placed_joint.poses(np.array([position]))
-        free = np.flatnonzero(self._space.free(line, np.tile(pose, (len(line), 1))))
-        return line[free[-1]] if len(free) and free[-1] < len(track) else q
+        return q if self._space.free([q], pose)[0] else track[min(max(int(along), 0), TRACK - 1)]
 
 
 class ScriptedArticulated:
@@ -277,9 +272,9 @@ class ScriptedArticulated:
         q = task.targets[env, :dof].double().cpu().numpy()
         start = q
         if self._pushing[env] and not is_new:
-            done = int(self._along[env] / self._step[env]) + 1
-            track = self._track[env, :done, :dof].double().cpu().numpy()
-            start = planner.retreat(q, track, position)
+            moved = float((position - self._begun[env]) * self._lever[env])
+            track = self._track[env, :, :dof].double().cpu().numpy()
+            start = planner.retreat(q, track, moved / float(self._step[env]), position)
         steps_left = int(task.max_episode_steps[env] - task.episode_step[env])
         plan = planner.plan(start, position, goal, int(self._num_plans[env]), steps_left)
         self._num_plans[env] += 1
@@ -310,10 +305,7 @@ class ScriptedArticulated:
         ahead = expected - moved
         grow = self._pushing & (self._still > 2) & (ahead > self._lead - SPEED)
         self._lead = torch.where(grow, self._lead + LEAD_STEP, self._lead).clamp(max=MAX_LEAD)
-        # Joints that cannot go on as fast as the tool should are waited for.
-        step = task.robot_tables.max_step[task.env_robot_index].clamp(min=1e-9)
-        late = ((self._on_track(self._track) - task.targets) / step).abs().amax(dim=1) > 1
-        go = self._pushing & (ahead < self._lead) & ~late
+        go = self._pushing & (ahead < self._lead)
         self._along = torch.minimum(self._along + torch.where(go, SPEED, 0.0), self._length)
         stuck = self._pushing & (self._still > PATIENCE)
         failed: torch.Tensor = self._active & (stuck | (moved < -PROGRESS))
