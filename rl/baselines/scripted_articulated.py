@@ -64,6 +64,9 @@ LEAD, MAX_LEAD = 0.03, 0.25
 MOVING = 0.02  # speed of the contact point from which the object counts as moving [m/s]
 PATIENCE = 50  # control steps in which the object must move by ``PROGRESS``; else plan again
 PROGRESS = MOVING * PATIENCE * CONTROL_PERIOD  # [m]
+MAX_FAILED = 2
+"""Number of plans of an episode that may find no path: each takes seconds, and after two, none was
+seen to find one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,9 +218,10 @@ class ScriptedArticulated:
             self._begin(task)
         position, goal = self._positions(task)
         new = self.ours & (task.episode_step == 0)
-        self._num_plans[new] = 0
+        self._num_plans[new], self._num_failed[new] = 0, 0
         failed = self._advance(task, position) | (self.ours & ~self._active)
-        for env in torch.nonzero(new | (failed & (self._num_plans < MAX_PLANS)))[:, 0].tolist():
+        left = (self._num_plans < MAX_PLANS) & (self._num_failed < MAX_FAILED)
+        for env in torch.nonzero(new | (failed & left))[:, 0].tolist():
             self._plan(task, env, float(position[env]), float(goal[env]), is_new=bool(new[env]))
         on_track = self._on_track(self._track)
         targets = torch.where(self._pushing[:, None], on_track, self._follower.waypoint)
@@ -237,8 +241,8 @@ class ScriptedArticulated:
         self.ours, self._active, self._pushing = torch.zeros(3, n, dtype=torch.bool, device=device)
         for rows, _ in self._groups:
             self.ours[rows] = True
-        self._num_plans, self._settling, self._still = torch.zeros(
-            3, n, dtype=torch.int64, device=device
+        self._num_plans, self._num_failed, self._settling, self._still = torch.zeros(
+            4, n, dtype=torch.int64, device=device
         )
         self._track = task.targets[:, None].repeat(1, TRACK, 1)
         self._moves = torch.zeros(n, TRACK, device=device)
@@ -280,6 +284,7 @@ class ScriptedArticulated:
         self._num_plans[env] += 1
         self._active[env], self._pushing[env] = plan is not None, False
         if plan is None:
+            self._num_failed[env] += 1
             return
         way = plan.path if start is q else (start, *plan.path)
         self._follower.follow(env, way)
