@@ -171,13 +171,15 @@ class FreeSpace:
             _with_surroundings(scene, self._obstacles, bases, self._block)
         )
 
-    def free(self, q: ArrayLike, blocks: ArrayLike | None = None) -> NDArray[np.bool_]:
+    def free(
+        self, q: ArrayLike, blocks: ArrayLike | None = None, *, stop: bool = False
+    ) -> NDArray[np.bool_]:
         """Return which configurations (n, dof) [rad or m] are free, shape (n,).
 
         Where a block, at poses (n, 7) in the world, penetrates an obstacle or the root link, no
-        configuration is free.
+        configuration is free. With ``stop`` those after the first that is not free are not tested.
         """
-        return self._checker.free(self._positions(q, blocks))
+        return self._checker.free(self._positions(q, blocks), stop=stop)
 
     def free_fraction(
         self,
@@ -193,7 +195,8 @@ class FreeSpace:
         """
         count = max(math.ceil(np.abs(end - start).max() / resolution), 1) + 1
         line = start + np.linspace(0, 1, count)[:, None] * (end - start)
-        free = self.free(line, None if block is None else np.tile(block, (count, 1)))
+        blocks = None if block is None else np.tile(block, (count, 1))
+        free = self.free(line, blocks, stop=True)
         return 1.0 if free.all() else max(int(free.argmin()) - 1, 0) / (count - 1)
 
     def first_reachable(self, start: Array, ends: Array) -> int | None:
@@ -308,8 +311,12 @@ class FreeSpace:
             return np.tile(_AWAY, (n, 1)) if self.scene.object else np.zeros((n, 0))
         blocks = np.asarray(blocks, dtype=np.float64)
         self._require_blocks(blocks, n)
-        turns = [to_rpy(normalize((w, x, y, z))) for w, x, y, z in blocks[:, 3:].tolist()]
-        return np.concatenate([blocks[:, :3], np.array(turns).reshape(n, 3)[:, ::-1]], axis=1)
+        rotations = blocks[:, 3:]
+        if n and (rotations == rotations[0]).all():  # as along a path: the block stands still
+            rotations = rotations[:1]
+        turns = [to_rpy(normalize((w, x, y, z))) for w, x, y, z in rotations.tolist()]
+        rpy = np.broadcast_to(np.array(turns).reshape(-1, 3), (n, 3))
+        return np.concatenate([blocks[:, :3], rpy[:, ::-1]], axis=1)
 
     def _require_blocks(self, blocks: Array, n: int) -> None:
         """Require n finite poses of the block, and a block."""

@@ -82,10 +82,11 @@ class SelfCollisionChecker:
         rows = self._require_rows(q)
         return (self._test(positions) for positions in movable_positions(self._robot, rows))
 
-    def free(self, q: ArrayLike) -> NDArray[np.bool_]:
+    def free(self, q: ArrayLike, *, stop: bool = False) -> NDArray[np.bool_]:
         """Return which configurations have no penetration, shape (n,).
 
-        Several times as fast as ``penetrations``, which says what penetrates.
+        Several times as fast as ``penetrations``, which says what penetrates. With ``stop`` those
+        after the first that is not free are not tested, and count as not free.
 
         q: Independent joint positions, shape (n, dof) [rad or m].
         """
@@ -107,6 +108,9 @@ class SelfCollisionChecker:
                     free[i] = not self._test(row)
                 elif data.ncon:
                     free[i] = data.contact.dist.min() >= -PENETRATION
+                if stop and not free[i]:
+                    free[i:] = False
+                    break
         return free
 
     def _require_rows(self, q: ArrayLike) -> Array:

@@ -62,12 +62,23 @@ class Tree:
     def __init__(self, roots: Array, step: Array, free_fraction: FreeFraction) -> None:
         """Start with roots (n, dof); ``step`` is the largest change of joints in a control step."""
         self._step, self._free_fraction = step, free_fraction
-        self.nodes = [*roots]
-        self._parents = [-1] * len(roots)
+        self._rows, self._parents = roots.copy(), [-1] * len(roots)
+
+    @property
+    def nodes(self) -> Array:
+        """The configurations, shape (nodes, dof)."""
+        return self._rows[: len(self._parents)]
+
+    def _add(self, q: Array, parent: int) -> int:
+        if len(self._parents) == len(self._rows):  # room for twice as many
+            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows), q[None]])
+        self._rows[len(self._parents)] = q
+        self._parents.append(parent)
+        return len(self._parents) - 1
 
     def nearest(self, q: Array) -> int:
         """Return the index of the node from which q, shape (dof,), takes the fewest steps."""
-        return int((np.abs(np.array(self.nodes) - q) / self._step).max(axis=1).argmin())
+        return int((np.abs(self.nodes - q) / self._step).max(axis=1).argmin())
 
     def extend(self, near: int, q: Array) -> int | None:
         """Add a node on the line from the node ``near`` to q, as far as the line is free.
@@ -80,9 +91,7 @@ class Tree:
         fraction = self._free_fraction(origin, new)
         if fraction * min(length, MAX_EDGE) < MIN_EDGE and fraction < 1:
             return None
-        self.nodes.append(new if fraction == 1 else origin + fraction * (new - origin))
-        self._parents.append(near)
-        return len(self.nodes) - 1
+        return self._add(new if fraction == 1 else origin + fraction * (new - origin), near)
 
     def connect(self, q: Array) -> int | None:
         """Extend the tree to q; return the index of q's node, None if q cannot be reached."""

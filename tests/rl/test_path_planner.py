@@ -223,7 +223,9 @@ def test_tested_configurations_are_no_farther_apart_than_the_resolution(
     far, resolution, monkeypatch
 ):
     space, tested, free = space_of(), [], FreeSpace.free
-    monkeypatch.setattr(FreeSpace, "free", lambda *args: tested.append(args[1]) or free(*args))
+    monkeypatch.setattr(
+        FreeSpace, "free", lambda *args, **stop: tested.append(args[1]) or free(*args, **stop)
+    )
     start = np.array([-0.5, -0.5])
     end = start + np.array([far, far / 3])
     planner = PathPlanner(space, STEP, 0, resolution=resolution)
