@@ -35,7 +35,7 @@ from morphgen.rl.runs.robot_source import Source, drawn_source, other_side, task
 from morphgen.rl.runs.training import ShowMetrics, Subrun
 from morphgen.splits.split import Side, require_side
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
-from morphgen.tasks.scenes.env_specs import GoalConfig, task_configs
+from morphgen.tasks.scenes.env_specs import GoalConfig
 
 
 @checked_signature
@@ -288,6 +288,8 @@ def clone(
     if isinstance(demonstrations, str | PathLike):
         demonstrations = [demonstrations]
     folders = [Path(each) for each in demonstrations]
+    if not folders:
+        raise TaskError("demonstrations: expected the folder of a data set, or several")
     spec = parse_agent(agent)
     if AGENTS[spec.agent].per_robot:
         raise TaskError(f"agent {spec.agent}: learns one robot; expected an agent of many")
@@ -336,6 +338,6 @@ def _cloning_config(
     options = SimpleNamespace(**vars(given) | words | {"max_links": links})
     config = run_config(source, spec, options)
     ppo = replace(config.ppo, num_steps=1, epochs=1, minibatches=1, curriculum=False)
-    own = {task.task: task for task in task_configs(data[0].settings["constants"])}
+    own = {task.task: task for task in data[0].configs}
     tasks = tuple(own.get(task.task, task) for task in config.tasks)
     return replace(config, ppo=ppo, tasks=tasks)

@@ -42,8 +42,7 @@ def recorded_source(data: Sequence[Demonstrations]) -> RecordedSource:
         TaskError: If one data set has robots among obstacles and another has not.
     """
     folders = [str(each.folder.resolve()) for each in data]
-    robots = [entries for each in data for entries in each.settings["robots"]]
-    obstacles = {bool(entries.get("obstacles")) for entries in robots}
+    obstacles = {bool(spec.scene.obstacles) for each in data for spec in each.specs.values()}
     if len(obstacles) > 1:
         raise TaskError("demonstrations among obstacles and without: clone them apart")
     tasks = dict.fromkeys(episode.task for each in data for episode in each.episodes)

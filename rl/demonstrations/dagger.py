@@ -17,7 +17,7 @@ from morphgen.rl.demonstrations.reader import Demonstrations
 from morphgen.rl.demonstrations.recording import RecordingConfig, best_of, record
 from morphgen.rl.inference import read_controller
 from morphgen.rl.runs.robot_source import robot_source
-from morphgen.tasks.scenes.env_specs import GoalConfig, task_configs
+from morphgen.tasks.scenes.env_specs import GoalConfig
 
 
 def read_planner(planner: str, tasks: Sequence[str]) -> None:
@@ -32,7 +32,7 @@ def read_planner(planner: str, tasks: Sequence[str]) -> None:
 def record_states(
     data: Demonstrations,
     folder: Path,
-    policy: Path,
+    policy: str | Path,
     planner: str,
     *,
     episodes: int,
@@ -44,23 +44,20 @@ def record_states(
     Args:
         data: Data set with the robots, their tasks and goals.
         folder: The data set to record.
-        policy: Folder of the policy's run.
+        policy: Folder of the policy's run, or another policy.
         planner: Baseline whose actions are the labels.
         episodes: Number of episodes of each robot at each task.
         seed: Seed of the episodes.
         jobs: Number of processes.
     """
-    settings = data.settings["robots"]
-    obstacles = any(entries.get("obstacles") for entries in settings)
-    keys = dict.fromkeys((each.robot_hash, each.task) for each in data.episodes)
     sources = tuple(
         robot_source(
-            str(data.folder / BODIES / robot),
+            str(data.folder / BODIES / data.robot_hashes[index]),
             task,
-            obstacles=obstacles,
-            goal_seed=settings[0]["goal_seed"],
+            obstacles=bool(spec.scene.obstacles),
+            goal_seed=spec.goals.seed,
         )
-        for robot, task in keys
+        for (index, task), spec in data.specs.items()
     )
     config = RecordingConfig(
         sources,
@@ -69,6 +66,6 @@ def record_states(
         episodes=episodes,
         seed=seed,
         sim=data.settings["sim"],
-        goals=GoalConfig(tasks=task_configs(data.settings["constants"])),
+        goals=GoalConfig(tasks=data.configs),
     )
     return record(folder, config, jobs=jobs)

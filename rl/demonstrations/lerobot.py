@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from morphgen.errors import TaskError
 from morphgen.extras import explain_missing_extras
 from morphgen.files import replacing_file, write_cache_file
-from morphgen.formats.data_files import read_json, read_text
+from morphgen.formats.data_files import parse_json, read_json, read_text
 from morphgen.formats.zip_files import read_all
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import CONTROL_PERIOD
@@ -333,17 +333,21 @@ def _write_json(path: Path, data: object) -> None:
 
 def read_index(folder: Path) -> list[dict[str, Any]]:
     """Return the rows of the robots, which ``robot_index`` refers to."""
-    return [json.loads(line) for line in read_text(folder / INDEX).splitlines()]
+    return [parse_json(line, INDEX) for line in read_text(folder / INDEX).splitlines()]
 
 
-def read_episodes(folder: Path) -> list[dict[str, Any]]:
-    """Return the rows of the episodes, without their statistics."""
-    import pyarrow.parquet as pq
+def read_episodes(folder: Path) -> Iterator[dict[str, Any]]:
+    """Yield the numbers and texts in the rows of the episodes."""
+    from pyarrow.types import is_large_string, is_primitive, is_string
 
-    path = folder / EPISODES_FILE
-    names = [name for name in pq.read_schema(path).names if not name.startswith("stats/")]
-    rows: list[dict[str, Any]] = pq.read_table(path, columns=names).to_pylist()
-    return rows
+    file = _open_parquet(folder / EPISODES_FILE)
+    kinds = is_primitive, is_string, is_large_string
+    names = [each.name for each in file.schema_arrow if any(is_a(each.type) for is_a in kinds)]
+    size = 0
+    for batch in file.iter_batches(_ROWS_AT_ONCE, columns=names):
+        if (size := size + batch.nbytes) > MAX_EPISODE_BYTES:
+            raise ValueError(f"{EPISODES_FILE}: more than {MAX_EPISODE_BYTES // 2**20} MB")
+        yield from batch.to_pylist()
 
 
 def data_files(folder: Path) -> list[Path]:
@@ -351,15 +355,57 @@ def data_files(folder: Path) -> list[Path]:
     return sorted((folder / "data").glob("*/*.parquet"))
 
 
-def read_columns(folder: Path) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Yield the features of all steps by name: arrays (frames,), or (frames, size)."""
-    import pyarrow.parquet as pq
+def read_columns(folder: Path) -> dict[str, NDArray[Any]]:
+    """Return the features of all steps by name: arrays (frames,), or (frames, size)."""
+    import pyarrow as pa
 
-    table = pq.read_table([str(path) for path in data_files(folder)])
+    tables = []
+    for path in data_files(folder):
+        file = _open_parquet(path)
+        width = sum(_bits(each.type) for each in file.schema_arrow) / 8
+        if file.metadata.num_rows * width > _largest(path):
+            raise ValueError(f"{path.name}: {file.metadata.num_rows} steps in a file of its size")
+        tables.append(file.read())
+    columns = {}
+    table = pa.concat_tables(tables)
     for name in table.column_names:
         column = table[name].combine_chunks()
-        values = column.flatten().to_numpy() if hasattr(column.type, "list_size") else None
-        if values is None:
-            yield name, column.to_numpy(zero_copy_only=False)
+        if hasattr(column.type, "list_size"):
+            columns[name] = column.flatten().to_numpy().reshape(len(table), -1)
         else:
-            yield name, values.reshape(len(table), -1)
+            columns[name] = column.to_numpy(zero_copy_only=False)
+    return columns
+
+
+MAX_EPISODE_BYTES = 2**28  # of the rows of all episodes
+_ROWS_AT_ONCE = 64  # equal texts are stored once in a file, but not in memory
+_MAX_RATIO = 200
+"""Most bytes in memory per byte of a file: a stranger's file may repeat a number for ever."""
+
+
+def _largest(path: Path) -> int:
+    return 2**26 + _MAX_RATIO * path.stat().st_size
+
+
+def _open_parquet(path: Path) -> pyarrow.parquet.ParquetFile:
+    """Open a file whose columns are not much larger than the file."""
+    import pyarrow.parquet as pq
+
+    file = pq.ParquetFile(path)
+    groups = [file.metadata.row_group(i) for i in range(file.num_row_groups)]
+    if sum(each.total_byte_size for each in groups) > _largest(path):
+        raise ValueError(f"{path.name}: unpacks to more than {_MAX_RATIO} times its size")
+    if sum(each.num_rows for each in groups) != file.metadata.num_rows:
+        raise ValueError(f"{path.name}: its groups have other numbers of rows than the file")
+    return file
+
+
+def _bits(kind: pyarrow.DataType) -> int:
+    """Return the size of a number, or of a list of numbers."""
+    import pyarrow as pa
+
+    if pa.types.is_fixed_size_list(kind):
+        return int(kind.list_size) * _bits(kind.value_type)
+    if not pa.types.is_primitive(kind):
+        raise ValueError(f"a column has the type {kind}; expected numbers")
+    return int(kind.bit_width)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
@@ -17,7 +17,7 @@ from torch.utils.data import Dataset
 from morphgen.encoding.robot_hash import HASH_LENGTH
 from morphgen.encoding.tokens import default_max_links
 from morphgen.errors import FormatError, TaskError, one_line
-from morphgen.formats.data_files import read_json
+from morphgen.formats.data_files import read_bytes, read_json
 from morphgen.model.robot import Robot
 from morphgen.rl.demonstrations.lerobot import (
     BODIES,
@@ -38,7 +38,7 @@ from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import ground_under, load_robot, task_configs
 from morphgen.tasks.scenes.robot_tables import RobotTables, build_robot_tables
 from morphgen.tasks.sim.base import Scene, Simulation
-from morphgen.tasks.task import EnvSpec
+from morphgen.tasks.task import EnvSpec, TaskConfig
 
 
 @dataclass(frozen=True)
@@ -93,25 +93,65 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
             self.settings: dict[str, Any] = read_json(self.folder / RECORDING)
             if self.settings["format"] != FORMAT:
                 raise ValueError(f"format {self.settings['format']!r}; this version reads {FORMAT}")
-            self.columns = {
-                name: torch.from_numpy(np.array(values))
-                for name, values in read_columns(self.folder)
-            }
-            self.episodes = tuple(
-                RecordedEpisode(
-                    row["episode_index"],
-                    first=row["dataset_from_index"],
-                    **{name: row[name] for name in _OF_ROW},
-                )
-                for row in read_episodes(self.folder)
-            )
             self.robot_hashes = tuple(body["robot_hash"] for body in read_index(self.folder))
             if not all(map(_HASH.fullmatch, self.robot_hashes)):  # they name folders
                 raise ValueError(f"{INDEX}: expected hashes of {HASH_LENGTH} hexadecimal digits")
-        except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+            if len(set(self.robot_hashes)) < len(self.robot_hashes):
+                raise ValueError(f"{INDEX}: names a robot twice")
+            self.columns = {
+                name: torch.from_numpy(np.array(values))
+                for name, values in read_columns(self.folder).items()
+            }
+            self.episodes = tuple(self._read_episodes())
+            self._require_columns()
+            if not isinstance(self.settings["sim"], str):
+                raise ValueError("sim: expected the name of a simulator")
+            for episode in self.episodes:
+                self.settings["constants"][episode.task]  # a KeyError if it is missing
+        except (OSError, *_FAULTS) as error:
             why = one_line(str(error))
             raise FormatError(f"{self.folder} is no sound data set: {why}") from error
         self._tables: dict[int, RobotTables] = {}
+
+    def _read_episodes(self) -> Iterator[RecordedEpisode]:
+        """Yield the episodes, and require that each begins where the one before it ends."""
+        end = 0
+        for index, row in enumerate(read_episodes(self.folder)):
+            values = {name: row[name] for name in _OF_ROW}
+            episode = RecordedEpisode(index, first=end, **values)
+            place = row["episode_index"], row["dataset_from_index"]
+            if place != (index, end) or episode.length < 1:
+                raise ValueError(f"episode {index} does not begin where the one before it ends")
+            if episode.robot_index < 0 or not 0 <= episode.seed < 2**63:
+                raise ValueError(f"episode {index} has a negative robot_index or seed")
+            if self.robot_hashes[episode.robot_index] != episode.robot_hash:
+                raise ValueError(f"episode {index} has another robot than its robot_index")
+            end += episode.length
+            if end > len(self):
+                break
+            yield episode
+        if end != len(self) or not end:
+            raise ValueError(f"the episodes have {end} steps, and the files {len(self)}")
+
+    def _require_columns(self) -> None:
+        """Require that the columns which are read are there, and agree with the episodes."""
+        joints = self.columns["observation.state"].shape[1]
+        sizes = dict.fromkeys((*_OBSERVED[:3], "normalized_action"), joints)
+        sizes |= {"observation.object_pose": 7}
+        if "executed_action" in self.columns:
+            sizes["executed_action"] = joints
+        for name, size in sizes.items():
+            values = self.columns[name]
+            if values.dtype != torch.float32 or values.shape[1:] != (size,):
+                raise ValueError(f"{name}: expected {size} numbers of 32 bits per step")
+        if self.columns["next.reward"].numel() != len(self):
+            raise ValueError("next.reward: expected a number per step")
+        lengths = [episode.length for episode in self.episodes]
+        frames = torch.cat([torch.arange(length) for length in lengths])
+        index = torch.arange(len(lengths)).repeat_interleave(torch.tensor(lengths))
+        for name, values in (("frame_index", frames), ("episode_index", index)):
+            if not torch.equal(self.columns[name], values):
+                raise ValueError(f"{name} disagrees with the lengths of the episodes")
 
     def __len__(self) -> int:
         """Return the number of steps."""
@@ -128,18 +168,31 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
     @cached_property
     def robots(self) -> tuple[Robot, ...]:
         """The robots, which ``robot_index`` refers to, with primitives as collision shapes."""
-        return tuple(load_robot(self.folder / BODIES / each) for each in self.robot_hashes)
+        robots = tuple(load_robot(self.folder / BODIES / each) for each in self.robot_hashes)
+        if max(robot.dof for robot in robots) > self.columns["observation.state"].shape[1]:
+            raise FormatError(f"{self.folder}: a robot has more joints than the steps")
+        return robots
+
+    @cached_property
+    def configs(self) -> tuple[TaskConfig, ...]:
+        """Constants of the tasks."""
+        try:
+            return task_configs(self.settings["constants"])
+        except _FAULTS as error:
+            raise FormatError(f"{self.folder / RECORDING}: constants: {error}") from error
 
     @cached_property
     def specs(self) -> Mapping[tuple[int, str], EnvSpec]:
         """Environments by robot index and task, with the goals of the data set."""
-        configs = {each.task: each for each in task_configs(self.settings["constants"])}
+        configs = {each.task: each for each in self.configs}
         keys = dict.fromkeys((episode.robot_index, episode.task) for episode in self.episodes)
         specs = {}
         for robot_index, task in keys:
             robot, kind = self.robots[robot_index], TASKS[task]
             path = self.folder / BODIES / self.robot_hashes[robot_index] / "goals" / f"{task}.npz"
-            goals = goals_from_npz(path.read_bytes(), task, path)
+            goals = goals_from_npz(read_bytes(path), task, path)
+            if goals.q.shape[1] != robot.dof:
+                raise FormatError(f"{path}: goals of {goals.q.shape[1]} joints, not {robot.dof}")
             scene = kind.scene(robot, goals, ground_under(robot))
             specs[robot_index, task] = EnvSpec(robot, task, scene, goals, configs[task])
         return specs
@@ -224,6 +277,8 @@ _OBSERVED = (
     *("observation.object_pose", "normalized_action", "episode_index", "frame_index"),
 )
 """Features that observations and labels are computed from."""
+_FAULTS = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+"""Errors that the content of a damaged data set may raise."""
 _HASH = re.compile(f"[0-9a-f]{{{HASH_LENGTH}}}")
 _OF_ROW = (
     *("robot_index", "robot_hash", "task", "policy", "seed", "success", "score", "distance"),

@@ -43,7 +43,7 @@ class Replay:
     def agrees(self) -> bool:
         """Whether the episode is as it was recorded."""
         errors = self.joint_error, self.object_error
-        is_near = max(errors) <= TOLERANCE
+        is_near = all(error <= TOLERANCE for error in errors)  # unlike of max, NaN is never near
         return is_near and self.success == self.episode.success and not self.faults
 
 

@@ -158,7 +158,8 @@ def set_npz(goals: GoalSet) -> bytes:
 def set_from_npz(content: bytes, kind: type[G]) -> G:
     """Read what ``set_npz`` wrote."""
     names = [field.name for field in fields(kind)]
-    arrays = read_npz(io.BytesIO(content), names)
+    # Sets are stored without compression; thousands of them may be read from a stranger's folder.
+    arrays = read_npz(io.BytesIO(content), names, max_bytes=2**22 + 16 * len(content))
     return kind(**{name: _value(name, array) for name, array in zip(names, arrays, strict=True)})
 
 

@@ -7,7 +7,8 @@ import torch
 
 import morphgen
 from morphgen.errors import TaskError
-from morphgen.rl.demonstrations.cloning import returns_of
+from morphgen.rl.demonstrations.cloning import recorded_source, returns_of
+from morphgen.rl.demonstrations.dagger import record_states
 from morphgen.rl.runs.checkpoint import read_checkpoint
 
 pytest.importorskip("pyarrow")
@@ -65,6 +66,16 @@ def test_dagger_labels_the_states_of_the_policy(demos, tmp_path):
     assert again.folder == run.folder
 
 
+def test_obstacles_are_those_of_the_goals_of_each_robot(tmp_path):
+    """A split says of each of its robots whether it is among obstacles."""
+    out = {"tasks": ["reach"], "obstacles": True, "episodes": 1, "out": tmp_path / "demos"}
+    data = morphgen.record("prims", **out)
+    del data.settings["robots"][0]["obstacles"]
+    assert recorded_source([data]).obstacles
+    states = record_states(data, tmp_path / "states", "jacobian", "ik", episodes=1, seed=1)
+    assert morphgen.demos(states).specs[0, "reach"].goals.key == data.specs[0, "reach"].goals.key
+
+
 def test_training_begins_with_the_networks_of_a_clone(demos, tmp_path):
     clone = morphgen.clone(demos.folder, epochs=0.5, minibatch=64, out=tmp_path / "clone")
     steps = {"steps": 256, "envs": 8, "constants": {"num_steps": 32, "minibatches": 2}}
@@ -80,6 +91,7 @@ def test_training_begins_with_the_networks_of_a_clone(demos, tmp_path):
     ("changes", "message"),
     [
         ({"agent": "se"}, "learns one robot"),
+        ({"demonstrations": []}, "expected the folder"),
         ({"epochs": 0}, "more than 0"),
         ({"dagger": "zero-shot"}, "no baseline; valid"),
         ({"dagger": "nobody"}, "no baseline; valid"),
@@ -87,7 +99,7 @@ def test_training_begins_with_the_networks_of_a_clone(demos, tmp_path):
 )
 def test_refusals(demos, tmp_path, changes, message):
     with pytest.raises(TaskError, match=message):
-        morphgen.clone(demos.folder, out=tmp_path / "run", **changes)
+        morphgen.clone(**{"demonstrations": demos.folder, "out": tmp_path / "run"} | changes)
     assert not (tmp_path / "run").exists()
 
 

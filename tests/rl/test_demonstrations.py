@@ -31,6 +31,7 @@ from morphgen.tasks.render.renderer import FRONT_FOV, WRIST, Renderer, RenderSta
 from morphgen.tasks.scenes.make import batch_from_specs
 from morphgen.tasks.scenes.robot_tables import build_robot_tables
 
+pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
 CHANNELS = ObservationConfig(
@@ -82,7 +83,7 @@ def test_the_folder_is_a_lerobot_data_set(folder):
         size = getattr(table.schema.field(name).type, "list_size", 1)
         assert [size] == feature["shape"], name
     assert table["index"].to_pylist() == list(range(len(table)))
-    rows = read_episodes(folder)
+    rows = [*read_episodes(folder)]
     assert [row["episode_index"] for row in rows] == [0, 1, 2, 3]
     assert sum(row["length"] for row in rows) == len(table)
     assert rows[-1]["dataset_to_index"] == len(table)
@@ -158,7 +159,11 @@ def test_items_are_steps_that_a_data_loader_collates(demos):
     [
         ("recording.json", '{"format": 9}', "format 9; this version reads 1"),
         ("recording.json", "[]", "no sound data set"),
+        ("recording.json", '{"format": 1, "sim": [], "constants": {}}', "name of a simulator"),
+        ("recording.json", '{"format": 1, "sim": "mujoco", "constants": {}}', "reach"),
         ("bodies/index.jsonl", '{"robot_hash": "../../mine"}', "32 hexadecimal digits"),
+        ("bodies/index.jsonl", f'{{"robot_hash": "{"0" * 32}"}}\n' * 2, "names a robot twice"),
+        ("bodies/index.jsonl", "[" * 100_000, "nested deeper"),
         ("data/chunk-000/file-000.parquet", "PAR1", "no sound data set"),
         ("meta/episodes/chunk-000/file-000.parquet", "", "no sound data set"),
     ],
@@ -170,6 +175,82 @@ def test_damaged_files_are_one_clear_error(folder, tmp_path, name, text, match):
     with pytest.raises(FormatError, match=match) as caught:
         morphgen.demos(copy)
     assert "\n" not in str(caught.value)
+
+
+DATA, EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
+
+
+def copy_with(folder, tmp_path, name, change):
+    """Return a copy of a data set in which a column of a Parquet file is changed."""
+    copy = tmp_path / "demos"
+    shutil.copytree(folder, copy)
+    file = DATA if "." in name or "action" in name else EPISODES
+    table = pq.read_table(copy / file)
+    values = change(table[name].to_pylist())
+    place, field = table.column_names.index(name), table.schema.field(name)
+    pq.write_table(table.set_column(place, field, pa.array(values, field.type)), copy / file)
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "match"),
+    [
+        ("length", lambda values: [0, *values[1:]], "does not begin where"),
+        ("length", lambda values: [*values[:-1], values[-1] + 1], "the episodes have"),
+        ("episode_index", lambda values: values[::-1], "does not begin where"),
+        ("robot_index", lambda values: [1 - each for each in values], "another robot"),
+        ("robot_index", lambda values: [9 for _ in values], "no sound data set"),
+        ("robot_index", lambda values: [-1 for _ in values], "negative"),
+        ("seed", lambda values: [None for _ in values], "no sound data set"),
+        ("task", lambda values: ["../../mine" for _ in values], "mine"),
+    ],
+)
+def test_episodes_that_disagree_with_their_steps_are_refused(folder, tmp_path, name, change, match):
+    with pytest.raises(FormatError, match=match):
+        morphgen.demos(copy_with(folder, tmp_path, name, change))
+
+
+def test_small_files_cannot_take_much_memory(folder, tmp_path):
+    copy = tmp_path / "demos"
+    shutil.copytree(folder, copy)
+    table = pq.read_table(copy / EPISODES)
+    place = table.column_names.index("policy")
+    rows = table.take([0] * 400)
+    wide = pa.DictionaryArray.from_arrays([0] * 400, ["x" * 2**20])
+    pq.write_table(rows.set_column(place, "policy", wide), copy / EPISODES, store_schema=False)
+    with pytest.raises(ValueError, match="more than 256 MB"):
+        list(read_episodes(copy))
+    steps = pa.table({"index": pa.array(np.zeros(50_000_000, np.int64))})
+    pq.write_table(steps, copy / DATA)
+    assert (copy / DATA).stat().st_size < 2**20
+    with pytest.raises(FormatError, match="50000000 steps in a file of its size"):
+        morphgen.demos(copy)
+    wide = pa.array(["x" * 2**27, "", "", ""])
+    pq.write_table(table.set_column(place, "policy", wide), copy / EPISODES, compression="zstd")
+    with pytest.raises(ValueError, match="unpacks to more than 200 times"):
+        list(read_episodes(copy))
+
+
+def test_goals_of_another_robot_or_none_are_refused(folder, tmp_path):
+    copy = tmp_path / "demos"
+    shutil.copytree(folder, copy)
+    paths = [copy / BODIES / each / "goals/reach.npz" for each in morphgen.demos(copy).robot_hashes]
+    shutil.copy(paths[0], paths[1])
+    with pytest.raises(FormatError, match=r"goals of \d joints, not"):
+        morphgen.verify(copy, episodes=1)
+    paths[1].unlink()
+    with pytest.raises(FormatError, match="no such file"):
+        morphgen.verify(copy, episodes=1)
+    np.savez_compressed(paths[1], q=np.zeros((2**20, 6)))
+    with pytest.raises(MorphgenError, match="its arrays have more than"):
+        morphgen.verify(copy, episodes=1)
+
+
+def test_a_position_that_is_not_finite_does_not_agree(described, tmp_path):
+    copy = copy_with(
+        described, tmp_path, "observation.object_pose", lambda rows: [[math.nan] * 7 for _ in rows]
+    )
+    assert not any(each.agrees for each in morphgen.verify(copy).replays)
 
 
 def test_the_channel_ik_is_refused(demos):
@@ -346,7 +427,7 @@ def test_cameras_add_videos(tmp_path):
         *("observation.images.front", "observation.images.front_depth"),
         *("observation.images.wrist", "observation.images.wrist_depth"),
     ]
-    rows = read_episodes(folder)
+    rows = [*read_episodes(folder)]
     stats = json.loads((folder / "meta/stats.json").read_text())
     for name in names:
         channels = info["features"][name]["shape"][2]
