@@ -297,7 +297,10 @@ def require_ray() -> ModuleType:
 
 @contextmanager
 def ray_cluster(address: str | None) -> Iterator[None]:
-    """Connect to the Ray cluster at an address, by default to a local one, in this block."""
+    """Connect to the Ray cluster at an address, by default to a local one, in this block.
+
+    An error of Ray that leaves the block becomes that of its task, or a ``MorphgenError``.
+    """
     ray = require_ray()
     was_connected = ray.is_initialized()
     host, _, port = (address or "").rpartition(":")
@@ -309,6 +312,11 @@ def ray_cluster(address: str | None) -> Iterator[None]:
         raise MorphgenError(f"no Ray cluster at {address!r}: {error}") from error
     try:
         yield
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause if isinstance(error.cause, MorphgenError) else error from None
+    except ray.exceptions.RayError as error:
+        why = f"a Ray worker died ({error}); finished results are kept: run again"
+        raise MorphgenError(why) from error
     finally:
         if not was_connected:
             ray.shutdown()

@@ -120,14 +120,12 @@ def describe(demos: Demonstrations) -> None:
 
 def _licenced_parts(folder: Path) -> tuple[LicencedPart, ...]:
     """Return the parts of all robots with their licences, sorted by licence and name."""
-    robots: dict[tuple[str, str, str], list[tuple[str, str]]] = {}
+    robots: dict[tuple[str, str, str], dict[tuple[str, str], None]] = {}
     for body in read_index(folder):
         card = read_json(folder / BODIES / body["robot_hash"] / CARD)
         for part in card.get("parts") or [{"part": body["name"], "licence": "unknown"}]:
             key = part["part"], part.get("licence", "unknown"), part.get("citation", "")
-            robots.setdefault(key, [])
-            if ("train", body["name"]) not in robots[key]:
-                robots[key].append(("train", body["name"]))
+            robots.setdefault(key, {})["train", body["name"]] = None
     found = [
         LicencedPart(name, find_licence(licence), citation, (*who,))
         for (name, licence, citation), who in robots.items()
@@ -228,9 +226,8 @@ def _croissant(
     ]
     steps = {name: each for name, each in info["features"].items() if each["dtype"] != "video"}
     episodes = ("episode_index", "robot_hash", "task", "policy", "seed", "success", "length")
-    rows = read_index(demos.folder)[0]
     data["recordSet"] = [
-        _records("robots", {"fileObject": {"@id": INDEX}}, {k: rows[k] for k in rows}),
+        _records("robots", {"fileObject": {"@id": INDEX}}, read_index(demos.folder)[0]),
         _records(
             "episodes",
             {"fileSet": {"@id": "episodes-files"}},

@@ -346,16 +346,9 @@ def make_on_ray(address: str | None) -> SetWorker:
     def work(config: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
         if not indices:
             return
-        try:
-            with ray_cluster(address):
-                absolute = replace(config, folder=config.folder.resolve())
-                yield from _distribute(ray, absolute, indices)
-        except ray.exceptions.RayTaskError as error:
-            raise error.cause if isinstance(error.cause, MorphgenError) else error from None
-        except ray.exceptions.RayError as error:
-            raise MorphgenError(
-                f"a Ray worker died ({error}); finished robots are kept: run again"
-            ) from error
+        with ray_cluster(address):
+            absolute = replace(config, folder=config.folder.resolve())
+            yield from _distribute(ray, absolute, indices)
 
     return work
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.encoding.tokens import tokens, tokens_npz
-from morphgen.errors import MorphgenError, TaskError
+from morphgen.errors import TaskError
 from morphgen.files import write_atomic
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import write_bundle
@@ -69,7 +69,7 @@ from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.render.renderer import Camera
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot
 from morphgen.tasks.scenes.make import batch_from_specs
-from morphgen.tasks.task import EnvSpec, GoalSet
+from morphgen.tasks.task import EnvSpec
 
 PLANNER = "scripted"
 """Policy that is the best baseline of each task: ``ik`` for reach, ``scripted`` for others."""
@@ -141,51 +141,37 @@ def _named(policy: str) -> str:
     return policy if policy in BASELINES or not Path(policy).exists() else Path(policy).name
 
 
-@dataclass(frozen=True)
-class RecordedRobot:
-    """A robot to record at some tasks: a unit of work."""
-
-    robot_hash: str
-    name: str
-    category: str  # grammar, ``composed``, or empty for a robot that is named by its file
-    source: Source
-    member: Member | None
-    """Member of a split or of the drawn robots; None if the source is one robot."""
-    tasks: tuple[tuple[str, bool], ...]
-    """Names of its tasks, and whether there are obstacles."""
+Unit = dict[str, tuple[Source, Member | OneRobot]]
+"""A robot to record, by task: its source, and the member of the split, or of the drawn robots."""
 
 
-def robots_of(config: RecordingConfig, jobs: int = 1) -> tuple[RecordedRobot, ...]:
-    """Return the robots of all sources in order; robots with the same hash are one."""
-    units: dict[str, RecordedRobot] = {}
+def robots_of(config: RecordingConfig, jobs: int = 1) -> dict[str, Unit]:
+    """Return the robots of all sources by their hashes, in order.
+
+    Raises:
+        TaskError: If a robot has a task both among obstacles and without.
+    """
+    units: dict[str, Unit] = {}
     for source in config.sources:
-        for member, unit in _units(source, config, jobs):
-            task = (member.task, member.obstacles) if member else unit.tasks[0]
-            known = units.setdefault(unit.robot_hash, replace(unit, tasks=()))
-            if task not in known.tasks:
-                units[unit.robot_hash] = replace(known, tasks=(*known.tasks, task))
-    return tuple(units.values())
-
-
-def _units(
-    source: Source, config: RecordingConfig, jobs: int
-) -> Iterator[tuple[Member | None, RecordedRobot]]:
-    if isinstance(source, OneRobot):
-        task = source.task, source.obstacles
-        yield None, RecordedRobot(source.robot_hash, source.name, "", source, None, (task,))
-        return
-    if isinstance(source, GrammarSource):
-        with stage(f"drawing {source.name} for {source.task}"):
-            of_source = draw(source, config.goals, jobs=jobs).members
-    else:
-        of_source = members(source)
-        if isinstance(source, SplitSource):  # the text of all robots, for which each has its own
-            source = replace(source, split="")
-    for member in of_source:
-        yield (
-            member,
-            RecordedRobot(member.robot_hash, member.name, member.category, source, member, ()),
-        )
+        described: Sequence[Member | OneRobot]
+        if isinstance(source, OneRobot):
+            described = (source,)
+        elif isinstance(source, GrammarSource):
+            with stage(f"drawing {source.name} for {source.task}"):
+                described = draw(source, config.goals, jobs=jobs).members
+        else:
+            described = members(source)
+            if isinstance(source, SplitSource):  # the text of all robots; each has its own
+                source = replace(source, split="")
+        for robot in described:
+            unit = units.setdefault(robot.robot_hash, {})
+            _, known = unit.setdefault(robot.task, (source, robot))
+            if known.obstacles != robot.obstacles:
+                raise TaskError(
+                    f"robot {robot.name}: {robot.task} both among obstacles and without; record "
+                    "them apart"
+                )
+    return units
 
 
 def record(folder: Path, config: RecordingConfig, *, jobs: int = 1, ray: str | None = None) -> Path:
@@ -208,22 +194,21 @@ def record(folder: Path, config: RecordingConfig, *, jobs: int = 1, ray: str | N
     settings = config.as_data(tasks)
     if (folder / INFO).is_file():
         _begin(folder, settings)  # raises if they are not those of the folder
+        shutil.rmtree(folder / SHARDS, ignore_errors=True)  # an interrupted run may have left them
         return folder
     robots = robots_of(config, jobs)
     _begin(folder, settings)
     with locked_folder(folder):
-        missing = [robot for robot in robots if not _shard(folder, robot).is_file()]
-        own, place = replace(config, sources=()), folder.resolve()
+        shards = {robot: _shard(folder, robot) for robot in robots}
+        missing = [robots[robot] for robot, shard in shards.items() if not shard.is_file()]
+        work = partial(record_robot, folder.resolve(), replace(config, sources=()))
         with stage("recording"):
             run = (
-                parallel_map(partial(record_robot, place, own), missing, jobs, 1)
-                if ray is None
-                else _on_ray(ray, place, own, missing)
+                parallel_map(work, missing, jobs, 1) if ray is None else _on_ray(ray, work, missing)
             )
             for _ in run:
                 pass
         try:
-            shards = {robot.robot_hash: _shard(folder, robot) for robot in robots}
             assemble(folder, shards, tasks, video_features(config.cameras, depth=config.depth))
         except TaskError:  # no episode succeeded: leave nothing behind
             for name in (BODIES, SHARDS):
@@ -234,8 +219,8 @@ def record(folder: Path, config: RecordingConfig, *, jobs: int = 1, ray: str | N
     return folder
 
 
-def _shard(folder: Path, robot: RecordedRobot) -> Path:
-    return folder / SHARDS / f"{robot.robot_hash}.npz"
+def _shard(folder: Path, robot: str) -> Path:
+    return folder / SHARDS / f"{robot}.npz"
 
 
 def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
@@ -258,55 +243,46 @@ def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
             )
 
 
-def _on_ray(
-    address: str, folder: Path, config: RecordingConfig, robots: Sequence[RecordedRobot]
-) -> Iterator[int]:
+def _on_ray(address: str, work: Callable[[Unit], int], units: Sequence[Unit]) -> Iterator[int]:
     """Record robots as tasks of a Ray cluster, whose machines share the folder."""
     ray = require_ray()
-    try:
-        with ray_cluster(address or None):
-            remote = ray.remote(num_cpus=1)(record_robot)
-            running = [remote.remote(folder, config, robot) for robot in robots]
-            while running:
-                (done, *_), running = ray.wait(running)
-                yield ray.get(done)
-                report(len(robots) - len(running), len(robots))
-    except ray.exceptions.RayTaskError as error:
-        raise error.cause if isinstance(error.cause, MorphgenError) else error from None
-    except ray.exceptions.RayError as error:
-        raise MorphgenError(
-            f"a Ray worker died ({error}); finished robots are kept: run again"
-        ) from error
+    with ray_cluster(address or None):
+        remote = ray.remote(num_cpus=1)(lambda unit: work(unit))
+        running = [remote.remote(unit) for unit in units]
+        while running:
+            (done, *_), running = ray.wait(running)
+            yield ray.get(done)
+            report(len(units) - len(running), len(units))
 
 
-def record_robot(folder: Path, config: RecordingConfig, unit: RecordedRobot) -> int:
+def record_robot(folder: Path, config: RecordingConfig, unit: Unit) -> int:
     """Write a robot's bundle and the shard of its episodes; return their number."""
-    library = default_library(tuple(map(Path, unit.source.library)))
-    body = folder / BODIES / unit.robot_hash
-    if unit.member is None:
-        robot = resolve_robot(unit.source.name, library)
+    source, described = next(iter(unit.values()))
+    library = default_library(tuple(map(Path, source.library)))
+    shard, body = _shard(folder, described.robot_hash), folder / BODIES / described.robot_hash
+    if isinstance(described, OneRobot):
+        robot = resolve_robot(described.name, library)
     else:
-        robot = compose_member(unit.member, library)
+        robot = compose_member(described, library)
     write_bundle(robot, body, picture=False, edits_kept=False)
     robot = load_robot(body)  # which the episodes are of
     arrays: dict[str, list[NDArray[Any]]] = {}
     episodes: list[dict[str, Any]] = []
     goals: dict[str, dict[str, Any]] = {}
-    fields = {f"field.{f.name}": f.size for task, _ in unit.tasks for f in TASKS[task].fields}
+    fields = {f"field.{f.name}": f.size for task in unit for f in TASKS[task].fields}
     (body / "goals").mkdir()
-    path_of = partial(video_path, _shard(folder, unit))
+    path_of = partial(video_path, shard)
     with filming(config.cameras, path_of, depth=config.depth) as film:
-        for task, obstacles in unit.tasks:
-            spec = env_spec(
-                robot,
-                task,
-                replace(config.goals, seed=unit.source.goal_seed),
-                obstacles=obstacles,
-                shipped=_shipped(unit),
-            )
+        for task, (source, each) in unit.items():
+            constants = replace(config.goals, seed=source.goal_seed)
+            shipped = None
+            if isinstance(source, SplitSource) and source.goal_dir:
+                sets = read_goals(source.goal_dir, source.side)
+                shipped = shipped_goal_set(sets, each.name, source.goal_dir)
+            spec = env_spec(robot, task, constants, obstacles=each.obstacles, shipped=shipped)
             (body / "goals" / f"{task}.npz").write_bytes(set_npz(spec.goals))
-            goals[task] = {"key": spec.goals.key, "obstacles": obstacles}
-            for episode, frames in _record_task(spec, config, unit.robot_hash):
+            goals[task] = {"key": spec.goals.key, "obstacles": each.obstacles}
+            for episode, frames in _record_task(spec, config, described.robot_hash):
                 if config.cameras:
                     episode["videos"] = film.add(spec, episode["seed"], frames)
                 episodes.append(episode)
@@ -314,28 +290,19 @@ def record_robot(folder: Path, config: RecordingConfig, unit: RecordedRobot) -> 
                 others = {k: np.zeros((length, n), np.float32) for k, n in fields.items()}
                 for name, values in (others | frames).items():
                     arrays.setdefault(name, []).append(values)
-    _write_body(body, robot, unit, goals, library, film.poses)
+    _write_body(body, robot, described, goals, library, film.poses)
     joined = {name: np.concatenate(values) for name, values in arrays.items()}
     joined["episodes"] = np.array(json.dumps(episodes))
     content = io.BytesIO()
     np.savez_compressed(content, **joined)  # type: ignore[arg-type]  # they are not allow_pickle
-    write_atomic(_shard(folder, unit), content.getvalue())
+    write_atomic(shard, content.getvalue())
     return len(episodes)
-
-
-def _shipped(unit: RecordedRobot) -> GoalSet | None:
-    source = unit.source
-    if unit.member is None or not isinstance(source, SplitSource) or not source.goal_dir:
-        return None
-    return shipped_goal_set(
-        read_goals(source.goal_dir, source.side), unit.member.name, source.goal_dir
-    )
 
 
 def _write_body(
     body: Path,
     robot: Robot,
-    unit: RecordedRobot,
+    described: Member | OneRobot,
     goals: Mapping[str, Mapping[str, Any]],
     library: Library,
     cameras: Mapping[str, Any],
@@ -349,23 +316,15 @@ def _write_body(
     joints = []
     for k, (lower, upper) in zip(robot.independent_joints, joint_limits(robot), strict=True):
         joint = robot.joints[k]
-        joints.append(
-            {
-                "name": joint.name,
-                "kind": joint.kind,
-                "lower": lower,
-                "upper": upper,
-                "velocity": joint.velocity,
-                "effort": joint.effort,
-            }
-        )
+        facts = {"name": joint.name, "kind": joint.kind, "lower": lower, "upper": upper}
+        joints.append(facts | {"velocity": joint.velocity, "effort": joint.effort})
     parts = robot.provenance.get("parts", [])
     assert isinstance(parts, list)
     licences = sorted({part.get("licence", "") for part in parts} - {""})
     data = {
-        "robot_hash": unit.robot_hash,
+        "robot_hash": described.robot_hash,
         "name": robot.name,
-        "category": unit.category,
+        "category": described.category if isinstance(described, Member) else "",
         "derivation": robot.provenance.get("derivation", ""),
         "licences": licences,
         "joints": joints,
@@ -411,7 +370,10 @@ def _record_task(
         generator = torch.Generator().manual_seed(seeds[0])
         for first in range(0, len(seeds), num_envs):
             own = seeds[first : first + num_envs]
-            for seed, episode, arrays in _episodes(batch, controllers, own, config, generator):
+            results, steps = _run(batch, controllers, own, config, generator)
+            stacked = {k: torch.stack([step[k] for step in steps]).cpu().numpy() for k in steps[0]}
+            for seed, episode in zip(own, results.episodes(batch), strict=True):
+                arrays = {k: v[: episode.steps, episode.env] for k, v in stacked.items()}
                 if not episode.diverged and (episode.success or not config.only_success):
                     facts = {"task": spec.task, "policy": _named(policy), "seed": seed}
                     facts |= {k: getattr(episode, k) for k in ("success", "score", "distance")}
@@ -460,20 +422,6 @@ def _run(
         values["done"] = step.terminated | step.truncated
         steps.append(values)
     return results, steps
-
-
-def _episodes(
-    batch: TaskBatch,
-    controllers: Sequence[Controller],
-    seeds: Sequence[int],
-    config: RecordingConfig,
-    generator: torch.Generator,
-) -> Iterator[tuple[int, Any, Arrays]]:
-    """Yield the seed and result of an episode of each environment, and its arrays by step."""
-    results, steps = _run(batch, controllers, seeds, config, generator)
-    stacked = {k: torch.stack([step[k] for step in steps]).cpu().numpy() for k in steps[0]}
-    for seed, episode in zip(seeds, results.episodes(batch), strict=True):
-        yield seed, episode, {k: v[: episode.steps, episode.env] for k, v in stacked.items()}
 
 
 def step_state(batch: TaskBatch) -> dict[str, torch.Tensor]:

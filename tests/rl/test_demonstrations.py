@@ -25,7 +25,7 @@ from morphgen.rl.demonstrations.lerobot import BODIES, INFO, read_episodes
 from morphgen.rl.demonstrations.recording import RecordingConfig, record
 from morphgen.rl.demonstrations.replay import replay
 from morphgen.rl.inference import run_episodes
-from morphgen.rl.runs.robot_source import drawn_source
+from morphgen.rl.runs.robot_source import drawn_source, robot_source
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.render.renderer import FRONT_FOV, WRIST, Renderer, RenderState
 from morphgen.tasks.scenes.make import batch_from_specs
@@ -276,6 +276,23 @@ def test_an_interrupted_recording_continues_to_the_same_bytes(folder, tmp_path, 
     monkeypatch.undo()
     record(copy, once)
     assert folder_hashes(copy) == folder_hashes(folder)
+
+
+def test_a_recording_that_was_interrupted_at_its_very_end_is_finished(folder, tmp_path):
+    copy = tmp_path / "demos"
+    shutil.copytree(folder, copy)
+    (copy / "shards").mkdir()
+    record(copy, config(noise=0.2))
+    assert folder_hashes(copy) == folder_hashes(folder)
+    assert not (copy / "shards").exists()
+
+
+def test_a_task_both_among_obstacles_and_without_is_refused(tmp_path):
+    """A robot's goals are a file per task."""
+    sources = [robot_source("prims", "reach", obstacles=each) for each in (False, True)]
+    with pytest.raises(TaskError, match="record them apart"):
+        record(tmp_path / "demos", RecordingConfig(tuple(sources)))
+    assert not (tmp_path / "demos").exists()
 
 
 @pytest.mark.slow
