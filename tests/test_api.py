@@ -18,6 +18,7 @@ from morphgen.errors import MorphgenError
 
 FUNCTIONS = (
     "check",
+    "clone",
     "compose",
     "conform",
     "demos",

@@ -188,20 +188,21 @@ MAX_BYTES = 2**30  # largest total size of the arrays of an archive [bytes]
 
 
 def read_npz(
-    source: Path | IO[bytes], names: Sequence[str], max_bytes: int = MAX_BYTES
+    source: Path | IO[bytes], names: Sequence[str], max_bytes: int | None = None
 ) -> list[NDArray[Any]]:
     """Return arrays of an archive by their names."""
     return [*read_all(source, names, max_bytes).values()]
 
 
 def read_all(
-    source: Path | IO[bytes], names: Sequence[str] | None = None, max_bytes: int = MAX_BYTES
+    source: Path | IO[bytes], names: Sequence[str] | None = None, max_bytes: int | None = None
 ) -> dict[str, NDArray[Any]]:
     """Return arrays of an archive by their names, all of them by default."""
+    most = MAX_BYTES if max_bytes is None else max_bytes
     try:
         with zipfile.ZipFile(source) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > max_bytes:
-                raise ValueError(f"its arrays have more than {max_bytes // 2**20} MB")
+            if sum(entry.file_size for entry in archive.infolist()) > most:
+                raise ValueError(f"its arrays have more than {most // 2**20} MB")
         with np.load(source, allow_pickle=False) as data:
             return {name: data[name] for name in (data.files if names is None else names)}
     except FileNotFoundError:

@@ -28,6 +28,7 @@ from morphgen.grammar.request import parse_words
 from morphgen.grammar.robot_set import SetConfig
 from morphgen.grammar.sampling import sample_robot
 from morphgen.model.dynamics import GRAVITY
+from morphgen.rl.demonstrations import lerobot
 from morphgen.rl.evaluation import EvalConfig, evaluate_baseline
 from morphgen.rl.runs import checkpoint as runs
 from morphgen.rl.runs import robot_source
@@ -106,6 +107,7 @@ FORMATS = {
     "release.json": release.FORMAT,
     "eval --submission": submission.FORMAT,
     ".npz": episode.FORMAT,
+    lerobot.RECORDING: lerobot.FORMAT,
 }
 
 
