@@ -459,17 +459,22 @@ class Learner:
                 ema_update(self.target_critic, self.critic, config.slow_decay)
                 metrics.append(torch.stack([*losses, *norms]))
 
-        if self.actor.normalizer is not None:
-            self.actor.normalizer.update(observations, self.processes)
-            for network in (self.critic, self.target_critic):
-                assert network.normalizer is not None
-                network.normalizer.load_state_dict(self.actor.normalizer.state_dict())
+        self._update_normalizers(observations)
         explained = explained_variance(values, returns)
         mean_metrics = torch.cat([torch.stack(metrics).mean(dim=0), explained[None]])
         mean_metrics = self.processes.sum(mean_metrics) / self.processes.size
         means = dict(zip(LEARN_METRICS, mean_metrics.tolist(), strict=True))
         self.actor_lr_scale = next_actor_lr_scale(config, self.actor_lr_scale, means["kl"])
         return {**means, "learning_rate": actor_group["lr"]}
+
+    def _update_normalizers(self, observations: Observation) -> None:
+        """Include observations (m, ...) in the statistics, which all networks share."""
+        if self.actor.normalizer is None:
+            return
+        self.actor.normalizer.update(observations, self.processes)
+        for network in (self.critic, self.target_critic):
+            assert network.normalizer is not None
+            network.normalizer.load_state_dict(self.actor.normalizer.state_dict())
 
     def _add_gradients(
         self, obs: Observation, minibatch: Mapping[str, torch.Tensor], robot_weights: torch.Tensor

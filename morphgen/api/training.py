@@ -225,13 +225,18 @@ def _with_networks_of(
         return config
     if agent != ME_GRAPH.name:
         raise TaskError(f"agent {agent}: the networks are those of {initial}")
-    (file, *others) = checkpoint_files(
-        checkpoint_path(Path(initial) if isinstance(initial, PathLike) else initial)
-    )
-    if others:
-        raise TaskError(f"{initial} has {len(others) + 1} policies: name one, such as {file}")
+    file = one_checkpoint(initial)
     policy = read_checkpoint(file)[0].policy
     return replace(config, policy=policy, initial_checkpoint=str(file.resolve()))
+
+
+def one_checkpoint(policy: str | PathLike[str]) -> Path:
+    """Return the checkpoint of a file, a run folder or a shipped policy, which must have one."""
+    path = checkpoint_path(Path(policy) if isinstance(policy, PathLike) else policy)
+    file, *others = checkpoint_files(path)
+    if others:
+        raise TaskError(f"{policy} has {len(others) + 1} policies: name one, such as {file}")
+    return file
 
 
 def resumed_config(folder: Path, *, resume: bool) -> RunConfig | None:

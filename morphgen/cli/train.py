@@ -57,13 +57,12 @@ from morphgen.rl.runs.robot_source import (
 )
 from morphgen.rl.runs.training import (
     ExecutionConfig,
-    checkpoint_files,
     finetuning_config,
     is_done,
     require_runnable,
     subruns_of,
 )
-from morphgen.rl.shipped_policies import POLICIES, checkpoint_path
+from morphgen.rl.shipped_policies import POLICIES
 from morphgen.splits.split_file import read_split, split_names
 from morphgen.tasks.registry import (
     DEFAULT_SIMULATOR,
@@ -140,17 +139,13 @@ def _next_command(run: TrainingRun) -> str:
 
 def finetune(args: argparse.Namespace) -> None:
     """Train and print the path of the checkpoint."""
-    files = list(checkpoint_files(checkpoint_path(args.checkpoint)))
-    if len(files) > 1:
-        raise TaskError(
-            f"{args.checkpoint} has {len(files)} policies: name one, such as {files[0]}"
-        )
+    file = training.one_checkpoint(args.checkpoint)
     shipped = args.checkpoint in POLICIES
-    parent = Path("runs") / args.checkpoint if shipped else files[0].parent
+    parent = Path("runs") / args.checkpoint if shipped else file.parent
     folder = args.out or parent / "finetuned" / f"{args.on}-seed{args.seed}"
     with training_progress(RESUME) as display:
         given = SimpleNamespace(**vars(args), show=display.training)
-        run = train_run(folder, _finetuning_config(files[0], folder, args), given)
+        run = train_run(folder, _finetuning_config(file, folder, args), given)
     print_run(run, args.minutes)
 
 

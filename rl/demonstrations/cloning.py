@@ -24,7 +24,14 @@ from morphgen.rl.config import PPOConfig
 from morphgen.rl.demonstrations.lerobot import data_files
 from morphgen.rl.demonstrations.reader import Demonstrations
 from morphgen.rl.distributed import UpdateMetrics
-from morphgen.rl.ppo import Learner, ema_update, half_square, matching_loss, symlog
+from morphgen.rl.ppo import (
+    Learner,
+    ema_update,
+    explained_variance,
+    half_square,
+    matching_loss,
+    symlog,
+)
 from morphgen.rl.runs.checkpoint import RunConfig
 from morphgen.rl.runs.robot_source import RecordedSource, num_actuated
 from morphgen.tasks.batch import TaskBatch
@@ -152,7 +159,8 @@ class Cloner(Learner):
         parts.clear()
         self._returns = torch.cat([returns_of(data, self.config.gamma) for data in batches.data])
         for start in range(0, total, CHUNK):
-            self._normalize({k: v[start : start + CHUNK] for k, v in self._seen.items()})
+            chunk = {name: value[start : start + CHUNK] for name, value in self._seen.items()}
+            self._update_normalizers({name: each.to(self.device) for name, each in chunk.items()})
 
     @staticmethod
     def _require_memory(part: dict[str, torch.Tensor], total: int) -> None:
@@ -162,14 +170,6 @@ class Cloner(Learner):
                 f"the observations of {total:,} steps take {need:.0f} GiB; at most {MAX_GIB} are "
                 "used: record fewer episodes"
             )
-
-    def _normalize(self, seen: dict[str, torch.Tensor]) -> None:
-        if self.actor.normalizer is None:
-            return
-        self.actor.normalizer.update({name: each.to(self.device) for name, each in seen.items()})
-        for network in (self.critic, self.target_critic):
-            assert network.normalizer is not None
-            network.normalizer.load_state_dict(self.actor.normalizer.state_dict())
 
     def iterate(self) -> UpdateMetrics:
         """Take a gradient step on random steps of the demonstrations."""
@@ -203,8 +203,6 @@ class Cloner(Learner):
         if not math.isfinite(loss):
             raise TaskError(f"update {self.update}: the loss is not finite; lower learning_rate")
         wanted = symlog(returns) if config.symlog else returns
-        spread = float(wanted.var())
-        left = float((wanted - values.detach()).var())
         seconds = time.perf_counter() - started
         return UpdateMetrics(
             update=self.update,
@@ -223,7 +221,7 @@ class Cloner(Learner):
             clip_fraction=math.nan,
             actor_gradient=norms[0],
             critic_gradient=norms[1],
-            explained_variance=1 - left / spread if spread else 0.0,
+            explained_variance=float(explained_variance(values.detach(), wanted)),
             learning_rate=learning_rate,
             collect_seconds=0.0,
             learn_seconds=seconds,
