@@ -314,6 +314,7 @@ def clone(
             jobs=jobs,
         )
         data = [*data, *data_sets([states])]
+        describe(data[-1])
         config = replace(
             _cloning_config(data, spec, given),
             initial_checkpoint=f"../round{number - 1}/{CHECKPOINT}",

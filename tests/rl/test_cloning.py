@@ -60,6 +60,7 @@ def test_dagger_labels_the_states_of_the_policy(demos, tmp_path):
     label, executed = states.columns["normalized_action"], states.columns["executed_action"]
     assert not torch.equal(label, executed)
     assert run.config.initial_checkpoint.endswith("round0/checkpoint.pt")
+    assert morphgen.verify(states.folder, episodes=1).agrees
     again = morphgen.clone(
         demos.folder, dagger="jacobian", out=tmp_path / "run", resume=True, **small
     )
