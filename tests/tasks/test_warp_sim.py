@@ -105,7 +105,7 @@ def test_robots_of_one_structure_share_a_model_and_move_as_if_they_were_alone(
     names = {"body_pos", "body_mass", "geom_size", "geom_pos"}
     assert names <= structure.batched.keys() or rows == 1
     others = simulation(scenes)
-    for row in walks(arms, sim.q.shape[1])[: SECOND // 2]:
+    for row in walks(arms, sim.q.shape[1])[: SECOND // 4]:
         others.step(row[list(order)])
         sim.step(row)
     assert torch.allclose(others.q, sim.q[list(order)], atol=1e-5)
@@ -152,7 +152,7 @@ def test_a_reset_changes_only_its_environments_and_forgets_their_past(arms, sim)
     home = sim.q.clone()
     targets = walks(arms, sim.q.shape[1])
     path = []
-    for row in targets[:20]:
+    for row in targets[:10]:
         sim.step(row)
         path.append(sim.q[1].clone())
     before = sim.q.clone()
@@ -162,7 +162,7 @@ def test_a_reset_changes_only_its_environments_and_forgets_their_past(arms, sim)
     assert torch.equal(sim.q[1], home[1])
     assert not sim.qd[1].any()
     assert torch.equal(sim.q[[0, 2]], before[[0, 2]])
-    for row, q_after in zip(targets[:20], path, strict=True):
+    for row, q_after in zip(targets[:10], path, strict=True):
         sim.step(row)
         assert torch.allclose(sim.q[1], q_after, atol=1e-6)
 
@@ -247,7 +247,7 @@ def test_static_shapes_are_where_each_robot_of_a_structure_has_them():
     ]
     assert len(structures(scenes, worlds(scenes, Contacts()))) == 1
     sim = simulation(scenes)
-    for _ in range(SECOND):
+    for _ in range(SECOND // 2):
         sim.step(sim.q)
     tops = torch.tensor([height + 0.05 for height in heights])
     assert torch.allclose(sim.object_pose[:, 2], tops, atol=1e-3)
@@ -260,7 +260,7 @@ def test_a_reset_moves_obstacles_and_blocks():
     block = torch.tensor([[2.0, 0.2, 0.4, 0.0, 0, 0, -1.0]])
     sim.reset(torch.tensor([True]), sim.q.clone(), block, poses)
     assert torch.allclose(sim.object_pose, block)
-    for _ in range(SECOND):
+    for _ in range(SECOND // 2):
         sim.step(sim.q)
     assert sim.object_pose[0, 2] == pytest.approx(0.2 + 0.075, abs=0.002)  # on the obstacle
 
