@@ -1,10 +1,12 @@
-"""Every reader of strangers' robots, with every kind of reference out of the robot's folder."""
+"""What a foreign file may read and how large it may be; hostile files; silence of packages."""
 
 import os
 import re
 import signal
+import struct
 import subprocess
 import sys
+from contextlib import closing
 
 import mujoco
 import pytest
@@ -12,11 +14,13 @@ import trimesh
 from PIL import Image
 from trimesh.exchange.stl import export_stl
 
+from helpers.fuzzing import MEMORY_MIB, Runner
 from helpers.robots import arm
 from helpers.uploads import archive
 from morphgen.api.checks import conform
 from morphgen.checks import check
 from morphgen.checks.conformance import conformance
+from morphgen.cli import main
 from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.bundle import MJCF, URDF, read_robot, split_colours, write_bundle
 from morphgen.formats.description import read_description
@@ -482,3 +486,202 @@ def test_no_number_of_mujocos_schema_takes_the_memory_of_the_machine(tmp_path):
             files[-1].write_text(MJCF_TEXT.format(inside, JOINTS))
     assert len(files) > 500
     require_bounds(files)
+
+
+BOX = '<robot name="r"><link name="a"><collision><geometry>{}</geometry></collision></link></robot>'
+MESH_HOSTILE_FILES = BOX.format('<mesh filename="{}"/>')
+
+
+def chain(links):
+    """Return a URDF of a chain of links."""
+    names = "".join(f'<link name="l{i}"/>' for i in range(links))
+    joints = "".join(
+        f'<joint name="j{i}" type="fixed"><parent link="l{i}"/><child link="l{i + 1}"/></joint>'
+        for i in range(links - 1)
+    )
+    return f'<robot name="r">{names}{joints}</robot>'
+
+
+def entities(depth):
+    """Return entities that expand twentyfold at each of ``depth`` levels."""
+    lines = [f'<!ENTITY e{n} "{f"&e{n - 1};" * 20 if n else "lol"}">' for n in range(depth)]
+    return f"<!DOCTYPE r [{''.join(lines)}]>"
+
+
+SOUND = '<robot name="r"><link name="a"/></robot>'
+URDFS = {
+    "nul": b"<robot name='r'>\0</robot>",
+    "truncated after a prefix": b'<robot name="r"><drake:x><link name="a',
+    "utf-16 without a mark": SOUND.encode("utf-16-le"),
+    "utf-16 with the wrong mark": b"\xff\xfe" + SOUND.encode("utf-16-be"),
+    "binary": bytes(range(256)) * 100,
+    "entity bomb": (entities(10) + '<robot name="&e9;"/>').encode(),
+    "deep": b"<robot>" * 100_000,
+    "many prefixes": b"<r>" + b"".join(b"<p%d:x/>" % i for i in range(5000)) + b"</r>",
+    "many attributes": b"<robot " + b" ".join(b'a%d="1"' % i for i in range(200_000)) + b">",
+    "huge": b'<robot name="r">' + b" " * 9_000_000 + b"</robot>",
+    "name that moves the cursor": b'<robot name="r&#x9b;2J"><link name="a"/></robot>',
+    "chain without end": chain(10_000).encode(),
+    "shapes without end": (
+        '<robot name="r"><link name="a">' + "<collision/>" * 20_000 + "</link></robot>"
+    ).encode(),
+    "unknown links": chain(900).replace('child link="', 'child link="x').encode(),
+    "many digits": BOX.format(f'<sphere radius="{"9" * 100_000}"/>').encode(),
+    "nul in a mesh's name": MESH_HOSTILE_FILES.format("%00.stl").encode(),
+    "long mesh name": MESH_HOSTILE_FILES.format("m" * 5000 + ".stl").encode(),
+}
+
+
+def refused(path, capsys, tmp_path, codes=(2,)):
+    """Assert that the three commands fail with one line each; return the line of ``check``."""
+    out = tmp_path / "out"
+    for words in (["show", path], ["import", path, "--out", out, "--no-picture"], ["check", path]):
+        code = main([str(word) for word in words])
+        printed, errors = capsys.readouterr()
+        if words[0] == "check":
+            assert code in (1, 2)
+        else:
+            assert code in codes, printed
+            assert len(errors.splitlines()) == 1
+            assert errors.startswith("morphgen: ")
+            assert len(errors) < 2000
+        text = printed + errors
+        assert all(c.isprintable() or c == "\n" for c in text)
+        assert "Traceback" not in text
+        assert "root:" not in text
+        assert not list(out.rglob("*")) if out.exists() else True
+    return text
+
+
+@pytest.mark.parametrize("name", URDFS)
+def test_a_hostile_urdf_is_a_one_line_error(name, tmp_path, capsys):
+    path = tmp_path / "x.urdf"
+    path.write_bytes(URDFS[name])
+    refused(path, capsys, tmp_path)
+
+
+def test_an_unreadable_mesh_is_a_one_line_error(tmp_path, capsys):
+    path = tmp_path / "x.urdf"
+    path.write_text(MESH_HOSTILE_FILES.format("count.stl"))
+    (tmp_path / "count.stl").write_bytes(b"x" * 80 + struct.pack("<I", 2**32 - 1) + bytes(500))
+    assert main(["import", str(path), "--out", str(tmp_path / "out"), "--no-picture"]) == 2
+    errors = capsys.readouterr().err
+    assert len(errors.splitlines()) == 1
+    assert "count.stl" in errors
+    assert main(["check", str(path)]) == 1
+    assert "mesh-unreadable" in capsys.readouterr().out
+    assert not (tmp_path / "out" / "r").exists()
+
+
+def test_files_that_are_not_regular_are_not_opened(tmp_path, capsys):
+    os.mkfifo(tmp_path / "pipe.urdf")
+    (tmp_path / "zero.urdf").symlink_to("/dev/zero")
+    (tmp_path / "folder.urdf").mkdir()
+    (tmp_path / "loop.urdf").symlink_to(tmp_path / "loop.urdf")
+    for path in sorted(tmp_path.glob("*.urdf")):
+        refused(path, capsys, tmp_path)
+    os.mkfifo(tmp_path / "m.stl")
+    (tmp_path / "x.urdf").write_text(MESH_HOSTILE_FILES.format("m.stl"))
+    assert "does not exist" in refused(tmp_path / "x.urdf", capsys, tmp_path)
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root reads all")
+def test_an_unreadable_file_is_an_error(tmp_path, capsys):
+    path = tmp_path / "x.urdf"
+    path.write_text(SOUND)
+    path.chmod(0)
+    refused(path, capsys, tmp_path)
+
+
+CARDS = {
+    "brackets": "[" * 100_000,
+    "levels": '{"format": ' + "[" * 500 + "]" * 500 + "}",
+    "digits": '{"format": ' + "9" * 5000 + "}",
+    "not text": b"\xff\xfe\x00",
+    "frame with a line break": '{"format": 1, "frames": {"a\\n\\u009b2J": {}}}',
+    "infinite": '{"format": Infinity}',
+}
+
+
+@pytest.mark.parametrize("name", CARDS)
+def test_a_hostile_card_is_a_one_line_error(name, tmp_path, capsys):
+    (tmp_path / "robot.urdf").write_text(SOUND)
+    content = CARDS[name]
+    (tmp_path / "card.json").write_bytes(
+        content if isinstance(content, bytes) else content.encode()
+    )
+    for command in ("show", "check"):
+        assert main([command, str(tmp_path)]) == 2
+        errors = capsys.readouterr().err
+        assert len(errors.splitlines()) == 1
+        assert "card.json" in errors or "has no link" in errors
+        assert all(c.isprintable() or c == "\n" for c in errors)
+
+
+def test_a_card_that_is_a_pipe_is_not_opened(tmp_path, capsys):
+    (tmp_path / "robot.urdf").write_text(SOUND)
+    os.mkfifo(tmp_path / "card.json")
+    assert main(["show", str(tmp_path)]) == 2
+    assert "holds no robot" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_hostile_urdfs_use_bounded_memory_and_time(tmp_path):
+    path = tmp_path / "x.urdf"
+    with closing(Runner(tmp_path)) as runner:
+        for name in ("many attributes", "shapes without end", "entity bomb"):
+            path.write_bytes(URDFS[name])
+            answer = runner.run("show", path)
+            assert answer["code"] == 2, answer
+            assert answer["mib"] < MEMORY_MIB, name
+
+
+PRINTING = """
+import ctypes
+from morphgen.formats.quiet import quiet
+libc = ctypes.CDLL(None)
+with quiet():
+    libc.printf(b"from C\\n")
+    print("from Python", flush=True)
+libc.printf(b"after\\n")
+libc.fflush(None)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="C's buffers are reached by POSIX's names")
+def test_buffered_c_output_is_not_printed_at_exit():
+    result = subprocess.run(
+        [sys.executable, "-c", PRINTING], capture_output=True, text=True, check=True
+    )
+    assert result.stdout == "after\n"
+    assert result.stderr == ""
+
+
+CODE = """
+import logging, sys
+import morphgen.formats.mjcf.write
+import mujoco
+
+logging.basicConfig(stream=sys.stdout, format="%(name)s %(levelname)s %(message)s")
+xml = "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+model = mujoco.MjModel.from_xml_string(xml)
+data = mujoco.MjData(model)
+data.qvel[0] = float("nan")
+mujoco.mj_step(model, data)
+"""
+
+
+MINE = "import mujoco; mujoco.set_mju_user_warning(lambda text: print('mine', text))\n"
+
+
+@pytest.mark.parametrize(("before", "name"), [("", "morphgen.mujoco WARNING"), (MINE, "mine")])
+def test_a_warning_is_logged_or_goes_to_the_users_callback_and_to_no_file(before, name, tmp_path):
+    result = subprocess.run(
+        [sys.executable, "-c", before + CODE],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=tmp_path,
+    )
+    assert result.stdout.startswith(f"{name} Nan, Inf or huge value in QVEL")
+    assert list(tmp_path.iterdir()) == []
