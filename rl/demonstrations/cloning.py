@@ -153,23 +153,28 @@ class Cloner(Learner):
                 states, action = batches.batch(number, frames)
                 seen = {k: v.clone() for k, v in self._needed(states.observe()).items()}
                 parts.append(seen | {"label": action[:, : self.num_link_rows].clone()})
-                self._require_memory(parts[0], total)
-        self._labels = torch.cat([part.pop("label") for part in parts])
-        self._seen = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-        parts.clear()
-        self._returns = torch.cat([returns_of(data, self.config.gamma) for data in batches.data])
+                place = self._place(parts[0], total)
+        joined = {name: torch.cat([part.pop(name) for part in parts]) for name in [*parts[0]]}
+        self._seen = {name: joined.pop(name).to(place) for name in [*joined]}
+        self._labels = self._seen.pop("label")
+        returns = [returns_of(data, self.config.gamma) for data in batches.data]
+        self._returns = torch.cat(returns).to(place)
         for start in range(0, total, CHUNK):
             chunk = {name: value[start : start + CHUNK] for name, value in self._seen.items()}
             self._update_normalizers({name: each.to(self.device) for name, each in chunk.items()})
 
-    @staticmethod
-    def _require_memory(part: dict[str, torch.Tensor], total: int) -> None:
+    def _place(self, part: dict[str, torch.Tensor], total: int) -> torch.device:
+        """Return the device that keeps all steps: a GPU if half of its memory holds them."""
         size = sum(value[0].numel() * value.element_size() for value in part.values())
         if (need := size * total / 2**30) > MAX_GIB:
             raise TaskError(
                 f"the observations of {total:,} steps take {need:.0f} GiB; at most {MAX_GIB} are "
                 "used: record fewer episodes"
             )
+        if self.device.type != "cuda":
+            return self.device
+        free, _ = torch.cuda.mem_get_info(self.device)
+        return self.device if size * total < free / 2 else torch.device("cpu")
 
     def iterate(self) -> UpdateMetrics:
         """Take a gradient step on random steps of the demonstrations."""
@@ -183,7 +188,7 @@ class Cloner(Learner):
             (self.batch.num_envs,),
             generator=self.generators["minibatches"],
             device=self.device,
-        ).cpu()
+        ).to(self._returns.device)
         obs = {name: value[rows].to(self.device) for name, value in self._seen.items()}
         head = self.actor.distribution(obs)
         log_prob = head.log_prob(self._labels[rows].to(self.device))
@@ -193,21 +198,25 @@ class Cloner(Learner):
         self.optimiser.zero_grad(set_to_none=True)
         (error.mean() - log_prob.mean()).backward()  # type: ignore[no-untyped-call]
         norms = [
-            float(nn.utils.clip_grad_norm_(network.parameters(), config.max_grad_norm))
+            nn.utils.clip_grad_norm_(network.parameters(), config.max_grad_norm)
             for network in (self.actor, self.critic)
         ]
         self.optimiser.step()
         ema_update(self.target_critic, self.critic, config.slow_decay)
         self.update += 1
-        loss = -float(log_prob.detach().mean())
+        wanted = symlog(returns) if config.symlog else returns
+        explained = explained_variance(values.detach(), wanted)
+        numbers = [-log_prob.mean(), error.mean(), head.entropy().mean(), returns.mean()]
+        # One transfer: each number that is read alone would wait for the GPU.
+        measured = torch.stack([*numbers, explained, *norms])
+        loss, value_loss, entropy, mean_return, share, *gradients = measured.detach().tolist()
         if not math.isfinite(loss):
             raise TaskError(f"update {self.update}: the loss is not finite; lower learning_rate")
-        wanted = symlog(returns) if config.symlog else returns
         seconds = time.perf_counter() - started
         return UpdateMetrics(
             update=self.update,
             transitions=self.update * self.batch.num_envs,
-            reward=float(returns.mean()),
+            reward=mean_return,
             score=math.nan,
             scores=(),
             success=math.nan,
@@ -215,13 +224,13 @@ class Cloner(Learner):
             unstable=0,
             terms={},
             policy_loss=loss,
-            value_loss=float(error.detach().mean()),
-            entropy=float(head.entropy().detach().mean()),
+            value_loss=value_loss,
+            entropy=entropy,
             kl=math.nan,
             clip_fraction=math.nan,
-            actor_gradient=norms[0],
-            critic_gradient=norms[1],
-            explained_variance=float(explained_variance(values.detach(), wanted)),
+            actor_gradient=gradients[0],
+            critic_gradient=gradients[1],
+            explained_variance=share,
             learning_rate=learning_rate,
             collect_seconds=0.0,
             learn_seconds=seconds,
