@@ -59,9 +59,10 @@ def test_ctrl_c_between_a_lock_and_its_release_ends_the_pool(monkeypatch):
 
     results = parallel_map(time.sleep, [0.0, 60.0, 60.0], 2, chunk=1)
     next(results)
-    monkeypatch.setattr(Condition, "__enter__", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        list(results)
+    with monkeypatch.context() as patched:  # else it would interrupt pytest as it sends its report
+        patched.setattr(Condition, "__enter__", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            list(results)
 
 
 def test_ctrl_c_that_python_loses_ends_the_pool_before_the_next_result():
