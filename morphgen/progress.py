@@ -26,8 +26,8 @@ class Progress(Protocol):
 class StagedProgress(Progress, Protocol):
     """A listener that shows stages of work by their titles, and notes."""
 
-    def stage(self, title: str) -> AbstractContextManager[None]:
-        """Show the reports of a block as a stage."""
+    def stage(self, title: str, unit: str = "") -> AbstractContextManager[None]:
+        """Show the reports of a block as a stage, which counts units; by default the listener's."""
 
     def note(self, text: str) -> None:
         """Show a line."""
@@ -95,10 +95,10 @@ class _Part:
         if self.listener is not None:
             self.listener(self.first + done, self.total)
 
-    def stage(self, title: str) -> AbstractContextManager[None]:
+    def stage(self, title: str, unit: str = "") -> AbstractContextManager[None]:
         """Show the reports of a block as a stage, which counts other items."""
         if isinstance(self.listener, StagedProgress):
-            return self.listener.stage(title)
+            return self.listener.stage(title, unit)
         return show_progress(self.listener)
 
     def note(self, text: str) -> None:
@@ -112,10 +112,10 @@ def part_of(total: int | None, first: int = 0) -> AbstractContextManager[None]:
     return show_progress(_Part(_listener.get(), total, first))
 
 
-def stage(title: str) -> AbstractContextManager[None]:
-    """Give the work of a block a title, for listeners that show stages."""
+def stage(title: str, unit: str = "") -> AbstractContextManager[None]:
+    """Give the work of a block a title, and a word for its items, for listeners of stages."""
     listener = _listener.get()
-    return listener.stage(title) if isinstance(listener, StagedProgress) else nullcontext()
+    return listener.stage(title, unit) if isinstance(listener, StagedProgress) else nullcontext()
 
 
 def note(text: str) -> None:

@@ -37,7 +37,7 @@ def bar(
     args: argparse.Namespace, title: str, unit: str = "robot", total: int | None = None
 ) -> Iterator[None]:
     """Show the progress of this block in a bar, and that of its stages in others; see ``_bar``."""
-    shown = _StagedBar(partial(_bar, args, unit=unit), partial(_bar, args, title, unit, total))
+    shown = _StagedBar(partial(_bar, args), unit, partial(_bar, args, title, unit, total))
     with closing(shown), show_progress(shown):
         yield
 
@@ -47,10 +47,11 @@ class _StagedBar:
 
     def __init__(
         self,
-        open_stage: Callable[[str], AbstractContextManager[Progress]],
+        open_stage: Callable[[str, str], AbstractContextManager[Progress]],
+        unit: str,
         open_bar: Callable[[], AbstractContextManager[Progress]],
     ) -> None:
-        self._open_stage, self._open_bar = open_stage, open_bar
+        self._open_stage, self._unit, self._open_bar = open_stage, unit, open_bar
         self._shown = ExitStack()
         self._show = self._shown.enter_context(open_bar())
 
@@ -59,10 +60,10 @@ class _StagedBar:
         self._show(done, total)
 
     @contextmanager
-    def stage(self, title: str) -> Iterator[None]:
+    def stage(self, title: str, unit: str = "") -> Iterator[None]:
         """Show the reports of a block in a bar of its own."""
         self.close()
-        with self._open_stage(title) as show, show_progress(show):
+        with self._open_stage(title, unit or self._unit) as show, show_progress(show):
             yield
         self._show = self._shown.enter_context(self._open_bar())
 
@@ -284,12 +285,13 @@ class TrainingProgress:
         return update
 
     @contextmanager
-    def stage(self, title: str) -> Iterator[None]:
-        """Show how many episodes of an evaluation ended."""
+    def stage(self, title: str, unit: str = "") -> Iterator[None]:
+        """Show how many episodes of an evaluation ended, or what else the stage counts."""
         raise_if_interrupted()
         self.close()
         layout = "{l_bar}{bar}| {n:.1f}/{total_fmt} [{elapsed}<{remaining}]"
-        with _bar(None, title, "episode", layout=layout, delay=0) as show, show_progress(show):
+        unit = unit or "episode"
+        with _bar(None, title, unit, layout=layout, delay=0) as show, show_progress(show):
             yield
 
     def note(self, text: str) -> None:

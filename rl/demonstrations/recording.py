@@ -157,7 +157,7 @@ def robots_of(config: RecordingConfig, jobs: int = 1) -> dict[str, Unit]:
         if isinstance(source, OneRobot):
             described = (source,)
         elif isinstance(source, GrammarSource):
-            with stage(f"drawing {source.name} for {source.task}"):
+            with stage(f"drawing {source.name} for {source.task}", "robot"):
                 described = draw(source, config.goals, jobs=jobs).members
         else:
             described = members(source)
@@ -202,7 +202,7 @@ def record(folder: Path, config: RecordingConfig, *, jobs: int = 1, ray: str | N
         shards = {robot: _shard(folder, robot) for robot in robots}
         missing = [robots[robot] for robot, shard in shards.items() if not shard.is_file()]
         work = partial(record_robot, folder.resolve(), replace(config, sources=()))
-        with stage("recording"):
+        with stage("recording", "robot"):
             run = (
                 parallel_map(work, missing, jobs, 1) if ray is None else _on_ray(ray, work, missing)
             )
