@@ -1,4 +1,4 @@
-"""The articulated objects: over the ranges of their parameters, alone and pushed in a scene."""
+"""Hashes and errors of objects, tables, and hints for unknown names."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ import torch
 from helpers.grammars import LIBRARY
 from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
-from morphgen.errors import CompositionError
+from morphgen.errors import CompositionError, nearest
 from morphgen.fitting.quality import signed_distance
 from morphgen.formats.urdf.read import read_urdf
 from morphgen.formats.urdf.write import urdf_text
@@ -20,6 +20,7 @@ from morphgen.model.geometry import Cylinder, Pose, Shape
 from morphgen.model.inertia import bounding_box
 from morphgen.model.robot import Inertial, Joint, Link, Robot
 from morphgen.model.rotation import from_rpy
+from morphgen.tables import fitted, table
 from morphgen.tasks.registry import SIMULATORS
 from morphgen.tasks.sim.articulated import ArticulatedObject, ObjectJoints
 from morphgen.tasks.sim.base import Scene
@@ -130,3 +131,99 @@ def test_requests_name_an_object_alone(words):
     assert name.startswith("dial")
     with pytest.raises(CompositionError, match="an object is no part of a robot"):
         parse_request(["object=dial", "arm=ur5"], LIBRARY)
+
+
+HEADERS = ("name", "dof", "source", "summary")
+ROWS = [("ur5", 6, "rtb-data", "a long arm of six joints"), ("z1", 6, "other", "short")]
+
+
+@pytest.mark.parametrize("formats", [None, "g"])
+def test_a_narrow_table_leaves_columns_out_and_names_them(formats):
+    whole = table(ROWS, HEADERS, formats=formats)
+    with fitted(1000):
+        assert table(ROWS, HEADERS, formats=formats) == whole
+    with fitted(30):
+        *lines, last = table(ROWS, HEADERS, formats=formats).splitlines()
+    for line, narrow in zip(whole.splitlines(), lines, strict=True):
+        assert line.startswith(narrow.rstrip())
+    assert lines[0].split() == ["name", "dof", "source"]
+    assert last == "(--wide shows summary)"
+    assert table(ROWS, HEADERS, formats=formats) == whole
+
+
+def test_a_text_is_shortened_where_that_keeps_its_column():
+    with fitted(41):
+        lines = table(ROWS, HEADERS).splitlines()
+    assert lines[2].split("  ")[-1] == "a long arm of..."
+    assert lines[3].split("  ")[-1].strip() == "short"
+    assert max(map(len, lines)) <= 41
+    assert "--wide" not in lines[-1]
+
+
+def test_less_important_columns_go_first():
+    with fitted(30):
+        lines = table(ROWS, HEADERS, last=["dof", "source"]).splitlines()
+    assert lines[0].split() == ["name", "summary"]
+    assert lines[-1] == "(--wide shows dof, source)"
+
+
+def test_one_column_remains_and_markdown_is_whole():
+    with fitted(12):
+        assert len(table(ROWS, HEADERS[::-1])) > 0
+        lines = table([row[::-1] for row in ROWS], HEADERS[::-1]).splitlines()
+        assert lines[2] == "a l..."
+        assert table(ROWS, HEADERS, style="github").count("|") == 4 * 5
+
+
+def test_long_texts_do_not_take_the_place_of_all_other_columns():
+    rows = [("a" * 100, "b" * 100, 1.0, 2.0)]
+    with fitted(80):
+        lines = table(rows, ("method", "words", "score", "success")).splitlines()
+    assert lines[2].split() == ["a" * 37 + "...", "b" * 35 + "..."]
+    assert lines[3] == "(--wide shows score, success)"
+    with fitted(80):
+        lines = table(rows, ("method", "words", "score", "success"), last=["words"]).splitlines()
+    assert lines[2].split() == ["a" * 37 + "...", "b" * 15 + "...", "1.0", "2.0"]
+
+
+def test_titles_of_plain_tables_are_a_row():
+    lines = table(ROWS, HEADERS, style="plain").splitlines()
+    assert [line.split()[:2] for line in lines] == [["name", "dof"], ["ur5", "6"], ["z1", "6"]]
+
+
+ARMS = ["jaco2", "jaco2_6dof", "kinova_gen3", "mico", "panda", "ur10", "ur3", "ur5"]
+MANY = [*ARMS, *(f"z{number:02}" for number in range(30))]
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("UR5", "; did you mean 'ur5'? nearest of 38: ur10, ur3, ur5"),
+        ("pnada", "; did you mean 'panda'?"),
+        ("jaco", "; did you mean 'jaco2'? nearest of 38: jaco2, jaco2_6dof"),
+        ("gen3", "; did you mean 'kinova_gen3'?"),
+        ("NONSENSE", f"; 38 are valid, such as {', '.join(ARMS)}"),
+        ("x" * 201, "; 38 are valid"),
+    ],
+)
+def test_a_long_list_shows_only_near_names(name, hint):
+    assert nearest(name, MANY) == hint
+
+
+@pytest.mark.parametrize(
+    ("name", "valid", "hint"),
+    [
+        ("nonsense", ["tongs", "prims"], "; valid: prims, tongs"),
+        ("gltf", ["usd", "glb"], "; did you mean 'glb'? valid: glb, usd"),
+        ("ur5-plne", ["cartpole"], "; valid: cartpole"),
+        ("any", [], "; valid: (none)"),
+    ],
+)
+def test_a_short_list_is_complete(name, valid, hint):
+    assert nearest(name, valid) == hint
+
+
+def test_the_closest_name_may_be_unlisted():
+    assert (
+        nearest("ee_size", ["arm", "ee"], ["ee.size"]) == "; did you mean 'ee.size'? valid: arm, ee"
+    )

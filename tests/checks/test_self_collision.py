@@ -1,23 +1,35 @@
-"""Self-collision tests and pairs to ignore."""
+"""Collisions of a robot with itself, and whether its motors hold it."""
 
+import re
 from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 import trimesh
 
+from helpers.composed import composed
 from helpers.robots import arm, chain
+from helpers.simulators import needs_pybullet
+from morphgen.checks import hold as module
+from morphgen.checks.hold import hold_files, overloads, step_targets
+from morphgen.checks.robot_srdf import collision_matrix, robot_srdf_text
 from morphgen.checks.self_collision import (
+    ALWAYS_SHARE,
     PENETRATION,
     SelfCollisionChecker,
     adjacent_pairs,
     survey_collisions,
 )
-from morphgen.errors import RobotError
+from morphgen.errors import FormatError, RobotError
+from morphgen.formats.bundle import read_bundle, write_bundle
+from morphgen.formats.srdf import LinkSpheres, parse_srdf, read_srdf, with_disabled_pairs
+from morphgen.grammar.robot_source import import_robot
 from morphgen.model.geometry import Box, Mesh, Pose, Shape, Sphere
-from morphgen.model.kinematics import random_configurations
-from morphgen.model.robot import Joint, Link, Robot
+from morphgen.model.kinematics import forward_kinematics, random_configurations
+from morphgen.model.robot import Frame, Inertial, Joint, Link, Robot
 
 BALL = (Shape(Sphere(0.05)),)
 
@@ -213,3 +225,327 @@ def test_repeated_epa_failure_is_an_error(monkeypatch):
         RobotError, match=r"'slides': MuJoCo finds no penetration depth .* \[0\.0, 0\.0\]: EPA"
     ):
         penetrations(slides(0.0, 0.08), [[0.0, 0.0]])
+
+
+SAMPLES = 400
+
+
+def ball_on_arm(name, radius):
+    return Link(name, collisions=(Shape(Sphere(radius)),))
+
+
+def at(x, z):
+    return Pose((x, 0.0, z))
+
+
+def balls():
+    """A robot of one ball per link, so that its collisions are distances between centres."""
+    links = (
+        ball_on_arm("base", 0.1),
+        ball_on_arm("turn", 0.05),
+        Link("bare"),
+        ball_on_arm("knob", 0.05),
+        ball_on_arm("slide", 0.05),
+        ball_on_arm("post", 0.1),
+        ball_on_arm("top", 0.1),
+        ball_on_arm("carrier", 0.05),
+        ball_on_arm("big", 0.87),
+    )
+    joints = (
+        Joint("turn", "revolute", "base", "turn", at(0.3, 0.0), (0, 0, 1), (-3.0, 3.0)),
+        Joint("bare", "fixed", "turn", "bare", at(0.0, 0.1)),
+        Joint("knob", "fixed", "bare", "knob", at(0.0, 0.1)),
+        Joint("slide", "prismatic", "knob", "slide", at(0.0, 0.0), (0, 0, 1), (-0.5, 0.5)),
+        Joint("post", "fixed", "base", "post", at(0.0, 0.25)),
+        Joint("top", "fixed", "post", "top", at(0.0, -0.1)),
+        Joint("carrier", "prismatic", "base", "carrier", at(0.0, 3.0), (1, 0, 0), (0.0, 1.0)),
+        Joint("big", "fixed", "carrier", "big", at(0.0, -2.75)),
+    )
+    home = (0.0, 0.3, 1.0)
+    return Robot("balls", links, joints, (Frame("tool", "slide"),), home, (("bare", "turn"),))
+
+
+def colliding_pairs(robot, q):
+    """Sets of pairs of colliding balls at configurations, by the distances of their centres."""
+    centres = forward_kinematics(robot, q)[..., :3, 3]
+    result = [set() for _ in q]
+    bodies = [(i, link) for i, link in enumerate(robot.links) if link.collisions]
+    for (i, a), (j, b) in combinations(bodies, 2):
+        reach = sum(link.collisions[0].geometry.radius for link in (a, b)) - PENETRATION
+        distances = np.linalg.norm(centres[:, i] - centres[:, j], axis=-1)
+        for k in np.flatnonzero(distances < reach):
+            result[k].add(tuple(sorted((a.name, b.name))))
+    return result
+
+
+def test_reasons_and_counts_agree_with_brute_force():
+    robot = balls()
+    matrix = collision_matrix(robot, samples=SAMPLES, seed=5)
+    q = random_configurations(robot, SAMPLES, np.random.default_rng(5))
+    colliding = colliding_pairs(robot, q)
+    counts = {
+        pair: sum(pair in pairs for pairs in colliding) for pair in sorted(set().union(*colliding))
+    }
+    assert matrix.collisions == counts
+    linked = {
+        ("base", "turn"),
+        ("knob", "turn"),
+        ("knob", "slide"),
+        ("base", "post"),
+        ("post", "top"),
+        ("base", "carrier"),
+        ("big", "carrier"),
+    }
+    (at_home,) = colliding_pairs(robot, np.array([robot.home]))
+    names = sorted(link.name for link in robot.links if link.collisions)
+    expected = {("bare", "turn"): "User"}
+    for pair in combinations(names, 2):
+        count = counts.get(pair, 0)
+        if pair in linked:
+            expected[pair] = "Adjacent"
+        elif pair in at_home:
+            expected[pair] = "Default"
+        elif count >= ALWAYS_SHARE * SAMPLES:
+            expected[pair] = "Always"
+        elif count == 0:
+            expected[pair] = "Never"
+    assert matrix.reasons == dict(sorted(expected.items()))
+    assert set(matrix.reasons.values()) == {"Adjacent", "Default", "Always", "Never", "User"}
+    assert matrix.reasons["base", "top"] == "Default"  # fixed to each other
+    assert matrix.reasons["big", "post"] == "Always"
+    assert ("slide", "turn") not in matrix.reasons  # collides at times
+    assert matrix.num_pairs == 28
+
+
+def test_srdf_holds_the_matrix_with_its_evidence():
+    robot = balls()
+    text = robot_srdf_text(robot, samples=50, seed=1)
+    matrix = collision_matrix(robot, samples=50, seed=1)
+    srdf = parse_srdf(text.encode(), "balls")
+    disabled = srdf.findall("disable_collisions")
+    assert {(p.get("link1"), p.get("link2")): p.get("reason") for p in disabled} == matrix.reasons
+    assert "28 pairs of links with collision shapes, 50 configurations sampled with seed 1" in text
+    defaults = [*matrix.reasons.values()].count("Default")
+    assert f"7 Adjacent, {defaults} Default" in text
+    assert text == robot_srdf_text(robot, samples=50, seed=1)
+    assert set(with_disabled_pairs(robot, srdf).ignore_pairs) == set(matrix.reasons)
+
+
+TEXT = """\
+<robot name="arm &amp; &quot;hand&quot;">
+  <group name="arm">
+    <chain base_link="base" tip_link="tool"/>
+  </group>
+  <group name="ee">
+    <link name="left"/>
+    <link name="right"/>
+  </group>
+  <group_state name="home" group="arm">
+    <joint name="shoulder" value="0.30000000000000004"/>
+    <joint name="elbow" value="-1e-17"/>
+    <joint name="extend" value="0.01"/>
+  </group_state>
+  <group_state name="home" group="ee">
+    <joint name="left" value="0.02"/>
+  </group_state>
+  <end_effector name="ee" parent_link="slider" group="ee" parent_group="arm"/>
+  <link_sphere_approximation link="upper">
+    <sphere center="0.1 -0.2 0.14285714285714285" radius="0.05"/>
+  </link_sphere_approximation>
+  <!-- """
+
+
+def test_gripper_of_an_imported_arm_is_an_end_effector(tmp_path):
+    robot = replace(arm(), name='arm & "hand"', home=(0.1 + 0.2, -1e-17, 0.01, 0.02))
+    spheres = (LinkSpheres("upper", (((0.1, -0.2, 1 / 7), 0.05),)),)
+    text = robot_srdf_text(robot, samples=10, spheres=spheres)
+    assert text.startswith(TEXT)
+    (tmp_path / "arm.srdf").write_text(text)
+    assert read_srdf(tmp_path / "arm.srdf").get("name") == robot.name
+
+
+def groups(robot):
+    root = parse_srdf(robot_srdf_text(robot, samples=10).encode(), "x")
+    return root, {group.get("name"): group for group in root.findall("group")}
+
+
+def test_arm_without_end_effector_has_one_group():
+    assert [*groups(balls())[1]] == ["arm"]
+
+
+def test_parts_of_composed_robots_are_end_effectors():
+    robot = composed("base=planar ee=cube")
+    root, found = groups(robot)
+    assert [*found] == ["arm", "ee"]
+    assert all(link.get("name").startswith("ee_") for link in found["ee"])
+    assert root.find("end_effector").get("parent_link") in robot.link_index
+
+
+def test_robot_without_tool_is_refused():
+    with pytest.raises(FormatError, match=r"'balls' has no frame 'tool'.*import FILE --tool LINK"):
+        robot_srdf_text(replace(balls(), frames=()))
+
+
+def held(robot, tmp_path, edit=lambda mjcf: mjcf):
+    folder = write_bundle(robot, tmp_path / "bundle", picture=False)
+    mjcf = folder / "robot.xml"
+    mjcf.write_text(edit(mjcf.read_text()))
+    return {row.simulator: row for row in hold_files(read_bundle(folder), folder)}
+
+
+def lever(effort):
+    """A bar of 2 kg whose centre of mass is 0.5 m beside its horizontal axis: 9.81 N m."""
+    inertial = Inertial(2.0, (0.5, 0.0, 0.0), (0.01, 0.0, 0.0, 0.05, 0.0, 0.05))
+    strength = {"limits": (-3.0, 3.0), "effort": effort, "velocity": 1.0}
+    joint = Joint("pivot", "revolute", "base", "bar", axis=(0, 1, 0), **strength)
+    return Robot("lever", (Link("base"), Link("bar", inertial)), (joint,), home=(0.0,))
+
+
+@needs_pybullet
+@pytest.mark.parametrize(("effort", "holds"), [(9.0, False), (11.0, True)])
+def test_a_motor_that_is_too_weak_lets_go_under_gravity(effort, holds, tmp_path):
+    rows = held(lever(effort), tmp_path)
+    assert rows["mujoco (mjcf)"].passed  # compensates gravity without the motor
+    row = rows["pybullet (urdf)"]
+    assert (row.passed, row.joint) == (holds, "pivot")
+    if not holds:
+        assert row.drift > 0.5
+        cause = "pivot needs 9.81 N m to carry the weight, its effort is 9"
+        assert row.causes == overloads(lever(effort), (0.0,)) == (cause,)
+
+
+@needs_pybullet
+@pytest.mark.parametrize("make", [arm, lambda: lever(30.0), lambda: lever(None)])
+def test_joints_hold_step_and_settle(make, tmp_path):
+    rows = held(make(), tmp_path)
+    assert list(rows) == ["mujoco (mjcf)", "pybullet (urdf)"]
+    assert rows["mujoco (mjcf)"].drift < 1e-6
+    for row in rows.values():
+        assert (row.passed, row.message) == (True, "")
+        assert row.drift < 1e-3
+        assert row.follower_error < 0.002
+        assert 0 < row.step_error <= 0.02
+        assert 0 < row.settling_time < 0.5
+
+
+def test_steps_lead_away_from_limits():
+    joints = arm().joints
+    shoulder = replace(joints[0], limits=(-2.0, 0.45))
+    elbow = replace(joints[1], kind="continuous", limits=None)
+    left = replace(joints[3], limits=(0.02, 0.02))
+    robot = replace(arm(), joints=(shoulder, elbow, joints[2], left, joints[4]))
+    # From home at 0.4, 0.5, 0.01 and 0.02; `left` has no room.
+    assert (step_targets(robot) - robot.home).round(6).tolist() == [
+        [-0.2, 0.0, 0.0, 0.0],
+        [0.0, 0.2, 0.0, 0.0],
+        [0.0, 0.0, 0.02, 0.0],
+    ]
+    near = replace(
+        robot,
+        home=(0.4, 0.5, 0.03, 0.02),
+        joints=(*joints[:2], replace(joints[2], limits=(0.02, 0.04)), *joints[3:]),
+    )
+    assert step_targets(near)[2, 2] == pytest.approx(0.03 + 0.8 * 0.01)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('kp="[^"]*" kv="[^"]*"', 'kp="1e-6" kv="1e-6"', "shoulder is 0.2 rad from its target"),
+        ('range="-2 2"', 'range="0.35 2"', "shoulder is 0.15 rad from its target"),
+        ('<joint name="right_mimic".*?/>', "", "right is "),
+    ],
+    ids=["weak", "blocked", "uncoupled"],
+)
+def test_a_joint_that_does_not_step_is_named(old, new, message, tmp_path):
+    row = held(arm(), tmp_path, lambda mjcf: re.sub(old, new, mjcf, count=1))["mujoco (mjcf)"]
+    assert (row.passed, row.causes) == (False, ())
+    assert row.drift < 1e-6
+    assert row.message.startswith(message)
+    assert "when " in row.message
+
+
+def test_a_rod_that_comes_off_its_leader_fails(tmp_path):
+    """A parallelogram in an arm, whose followers have no armature and a soft equality."""
+
+    def loosen(mjcf):
+        mjcf = re.sub(r'(<joint name="rod[12]"[^>]*?) armature="[^"]*"', r"\1", mjcf)
+        return re.sub(r' sol(ref|imp)="[^"]*"', "", mjcf)
+
+    robot = import_robot(Path(__file__).parent / "files" / "palletiser.urdf")
+    row = held(robot, tmp_path, loosen)["mujoco (mjcf)"]
+    assert (row.passed, row.causes) == (False, ())
+    assert row.drift < 1e-6  # it holds
+    assert row.follower_error > 0.5
+    assert re.match("rod[12] is .* rad from its leader when elbow steps by 0.2 rad", row.message)
+
+
+def test_drift_is_the_distance_to_which_an_actuator_pulls(tmp_path):
+    def pull(mjcf):
+        (ctrl,) = re.findall(r' ctrl="([^"]*)"', mjcf)
+        first, *others = ctrl.split()
+        return mjcf.replace(ctrl, " ".join([str(float(first) + 0.05), *others]))
+
+    row = held(arm(), tmp_path, pull)["mujoco (mjcf)"]
+    assert (row.passed, row.joint) == (False, "shoulder")
+    assert (row.drift, row.unit) == (pytest.approx(0.05, rel=0.02), "rad")
+    assert row.message == f"shoulder moves {row.drift:.3g} rad"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"home"', '"start"', "no keyframe 'home'"),
+        ('"elbow"', '"knee"', "lacks joints elbow"),
+        ("<worldbody>", "<nonsense>", "MuJoCo: "),
+        (
+            r'kp="[^"]*" kv="[^"]*"( ctrlrange="[^"]*") forcerange="[^"]*"',
+            r'kp="1e12" kv="0"\1',
+            "div",
+        ),
+        *(
+            ("</mujoco>", f'<option timestep="{dt}"/></mujoco>', "(MuJoCo: .*|robot.xml: )time")
+            for dt in ("1e-9", "0.00001", "nan")
+        ),
+    ],
+)
+def test_a_file_that_cannot_be_simulated_fails(old, new, message, tmp_path):
+    row = held(arm(), tmp_path, lambda mjcf: re.sub(old, new, mjcf))["mujoco (mjcf)"]
+    assert (row.passed, row.drift) == (False, None)
+    assert re.match(message, row.message)
+
+
+def test_a_robot_without_joints_holds(tmp_path):
+    block = replace(arm().root, name="block")
+    row = held(Robot("block", (block,)), tmp_path)["mujoco (mjcf)"]
+    assert (row.passed, row.drift) == (True, 0.0)
+
+
+def test_a_missing_simulator_is_reported(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    rows = held(arm(), tmp_path).values()
+    assert [(row.passed, row.message) for row in rows] == [(None, "not installed")] * 2
+
+
+def test_overloads_are_those_of_the_pose():
+    upright = replace(lever(9.0).joints[0], T_parent_joint=Pose.from_xyz_rpy(rpy=(1.5707963, 0, 0)))
+    assert overloads(replace(lever(9.0), joints=(upright,)), (0.0,)) == ()
+
+
+@pytest.mark.parametrize(
+    ("property_of_joint", "causes"),
+    [
+        ({"effort": 0.01}, ["ten times the effort limits are enough"]),
+        ({"damping": 40.0}, ["it settles without the joint damping"]),
+        (
+            {"damping": 10.0, "friction": 12.0},
+            ["it settles without the joint damping", "it settles without the dry friction"],
+        ),
+    ],
+)
+def test_a_property_without_which_a_joint_settles_is_a_cause(property_of_joint, causes, tmp_path):
+    light = Link("bar", Inertial(0.02, (0, 0, 0), (1e-3, 0, 0, 1e-3, 0, 1e-3)))
+    joint = replace(lever(5.0).joints[0], **property_of_joint)
+    robot = replace(lever(5.0).with_links([light]), joints=(joint,))
+    row = held(robot, tmp_path)["mujoco (mjcf)"]
+    assert (row.passed, row.causes) == (False, tuple(causes))

@@ -1,4 +1,4 @@
-"""``morphgen train``, ``eval``, ``finetune``, ``study`` and ``play`` with a trained policy."""
+"""Training, also on drawn robots, playback, evaluation and studies."""
 
 import json
 import re
@@ -6,16 +6,26 @@ import signal
 import subprocess
 from pathlib import Path
 
+import imageio.v2 as imageio
 import pytest
 
 from helpers.commands import start, tree
-from helpers.runs import NETWORK, ROLLOUT, RUN, SMALL
+from helpers.runs import NETWORK, ROLLOUT, RUN, SMALL, small_split
+from helpers.simulators import PYBULLET
+from helpers.splits import member, split
 from morphgen.benchmark.scores.submission import read_table
+from morphgen.cli import progress
+from morphgen.grammar.library import default_library
 from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, read_config
-from morphgen.rl.runs.robot_source import specs_of
+from morphgen.rl.runs.robot_source import FILE, fresh_source, members, read_drawn, specs_of
 from morphgen.rl.runs.training import METRICS, _StopRequest, read_metrics
+from morphgen.rl.shipped_policies import POLICIES, ShippedPolicy, policies_for
+from morphgen.splits.split import Member
+from morphgen.splits.split_file import write_split
 from morphgen.tasks.goals.split_goals import read_goals
 from morphgen.tasks.scenes.env_specs import GoalConfig
+from morphgen.viewer.robot_uri import DERIVATION, FileAccess
+from morphgen.viewer.simulation import training_robots
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
@@ -341,3 +351,271 @@ def test_foreign_folders_and_checkpoints_are_rejected(run, refused, tmp_path):
     layout = ("eval", "run", "--split", "planar-cube", "task=reach", "--obstacles")
     assert "for other observations: obstacles 0, here 3" in refused(*layout, "--episodes", "1")
     assert "table.txt" in refused("eval", "run", "--out", "table.txt")
+
+
+FEW = ("--agent", "me-mlp", "--train-goals", "3", "--no-tensorboard", *SMALL)
+RUN_DRAWN = ("train", "task=reach", *FEW, "--robots")
+
+
+@pytest.mark.slow
+def test_drawn_robots_are_trained_on_and_others_evaluated_and_played(run, ok, tmp_path):
+    code, out, err = run(*RUN_DRAWN, "cubes:3,stick:2", "--steps", "192")
+    folder = Path("runs/cubes-3-stick-2-reach/me-mlp/seed0")
+    assert (code, out) == (0, f"{folder}/checkpoint.pt\n")
+    assert "cubes:3,stick:2: update 6 of 6, 192 steps, score -" in err
+    config = read_config(folder)
+    assert (config.source.grammars, config.source.draw_seed) == ((("cubes", 3), ("stick", 2)), 0)
+    assert (config.slice_updates, config.max_links) == (3, 23)
+    assert {config.tasks[0].num_goals, config.tasks[1].num_goals} == {3}
+    robots = read_drawn(folder)
+    assert [each.name for each in robots] == [
+        *("cubes-000000", "cubes-000001", "cubes-000002"),
+        *("stick-000000", "stick-000001"),
+    ]
+    assert config.source.drawn_hash == json.loads((folder / FILE).read_text())["hash"]
+    assert [len(each["scores"]) for each in read_metrics(folder)] == [2] * 6
+    assert run(*RUN_DRAWN, "cubes:3,stick:2", "--steps", "192", "--resume")[0] == 0
+    code, _, err = run(
+        *RUN_DRAWN, "cubes:3,stick:2", "--steps", "192", "--resume", "--robot-seed", "1"
+    )
+    assert (code, "has another run" in err) == (2, True)
+
+    write_split(small_split(), tmp_path / "own.yaml")
+    evaluation = ("--episodes", "1", "--mode", "deterministic")
+    out = ok("eval", folder, "--split", "own.yaml", "--on", "test", *evaluation)
+    assert "gantry-plane" in out
+    known = Member("known", "cubes", robots[1].derivation, "reach", False, robots[1].robot_hash)
+    write_split(split((member("base=planar ee=cube"),), (known,)), tmp_path / "known.yaml")
+    code, _, err = run("eval", folder, "--split", "known.yaml", "--on", "test", *evaluation)
+    assert (code, err) == (0, "morphgen: the policy was trained on known\n")
+    code, out, _ = run("play", "reach", "planar-cube", "--policy", folder, "--sim", "mujoco")
+    assert (code, out[:10]) == (0, "episode 1:")
+
+    files = FileAccess(default_library().folders, (tmp_path,), tmp_path / "none")
+    listed = [(each.name, f"{DERIVATION}{each.derivation}") for each in robots]
+    assert training_robots(str(folder), files) == ("reach", False, listed)
+    (folder / FILE).unlink()
+    assert training_robots(f"{folder}/checkpoint.pt", files) == ("reach", False, [])
+    code, _, err = run("eval", folder, "--split", "own.yaml", "--on", "test", *evaluation)
+    assert code == 0
+    assert f"{folder} has no robots.json: it is unknown whether" in err
+
+
+@pytest.mark.parametrize(
+    "drawn",
+    [
+        "cubes:1,stick:2",
+        *(pytest.param(one, marks=pytest.mark.slow) for one in ("cubes:2", "stick:1")),
+    ],
+)
+def test_without_a_split_fresh_robots_are_evaluated(run, drawn):
+    run(*RUN_DRAWN, drawn, "--steps", "96", "--out", "run")
+    trained = {each.robot_hash for each in read_drawn(Path("run"))}
+    words = ("eval", "run", "--episodes", "1", "--mode", "deterministic")
+    found = []
+    for seed in (0, 0, 1):
+        code, out, err = run(*words, "--seed", str(seed), "--json")
+        assert code == 0
+        request, draw_seed, robots_hash = re.search(
+            r"fresh robots (\S+), drawn with seed (\d+), hash (\w+)", err
+        ).groups()
+        assert request == drawn
+        scores = json.loads(out)["deterministic"]
+        assert len(scores) == len(trained)
+        assert {score["side"] for score in scores} == {"test"}
+        found.append((draw_seed, robots_hash, out))
+    assert found[0] == found[1] != found[2]
+    source = read_config(Path("run")).source
+    fresh, _ = fresh_source(Path("run"), source, GoalConfig(), 0)
+    assert trained.isdisjoint(each.robot_hash for each in members(fresh))
+    code, _, err = run(*words, "--on", "train")
+    assert (code, "its policy is scored on fresh robots" in err) == (2, True)
+    (Path("run") / FILE).unlink()
+    code, _, err = run(*words)
+    assert (code, "no list of drawn robots" in err) == (2, True)
+
+
+def test_held_out_robots_are_skipped_and_fit_the_observations(run, tmp_path):
+    run(*RUN_DRAWN, "cubes:2", "--steps", "32", "--out", "free")
+    code, _, err = run("finetune", "free")
+    assert code == 2
+    assert "robots cubes:2 are drawn from grammars and have no test side" in err
+    assert "with --split" in err
+    (_, second) = read_drawn(Path("free"))
+    test = Member("known", "cubes", second.derivation, "reach", False, second.robot_hash)
+    large = split((member("base=planar ee=cube"),), (test,), provenance={"max_links": 25})
+    write_split(large, tmp_path / "own.yaml")
+    options = ("--held-out", "own.yaml", "--steps", "32", "--out", "run")
+    code, _, err = run(*RUN_DRAWN, "cubes:2", *options)
+    assert code == 0
+    assert "morphgen: robots that were skipped: 1 held out\n" in err
+    assert [each.name for each in read_drawn(Path("run"))] == ["cubes-000000", "cubes-000002"]
+    config = read_config(Path("run"))
+    assert config.source.held_out == (str(tmp_path / "own.yaml"),)
+    assert (config.slice_updates, config.max_links) == (0, 25)
+    assert read_checkpoint(Path("run"))[1]["layout"]["links"] == 25
+
+
+def test_workers_draw_for_a_simulator_that_has_none(run):
+    words = [*RUN_DRAWN, "cubes:2", "--steps", "32", "--workers", "2"]
+    words[words.index("mujoco")] = "kinematic"
+    assert run(*words)[0] == 0
+    assert len(read_drawn(Path("runs/cubes-2-reach/me-mlp/seed0"))) == 2
+
+
+LINE = re.compile(
+    r"episode (\d+): (success|failure), (\d+\.\d{3}) m from the (goal|line), "
+    r"score (-?\d+\.\d\d), (\d+\.\d\d) s"
+)
+
+
+def parse_episodes(out):
+    """Parse the printed line of every episode."""
+    return [LINE.fullmatch(line).groups() for line in out.splitlines() if "episode" in line]
+
+
+def test_ik_policy_reaches_the_goal(ok, tmp_path):
+    out = ok("play", "reach", "arm3-stick", "--policy", "ik", "--sim", "mujoco")
+    ((number, result, distance, place, score, seconds),) = parse_episodes(out)
+    assert (number, result, place, seconds) == ("1", "success", "goal", "6.00")
+    assert float(distance) < 0.03
+    assert float(score) > 0
+    assert tree(tmp_path) == {}
+
+
+@pytest.mark.slow
+def test_scripted_policy_pushes_before_the_time_limit_and_is_recorded(ok, tmp_path):
+    words = ("play", "push", "prims", "--policy", "scripted", "--sim", "mujoco")
+    out = ok(*words, "--out", "push.mp4")
+    ((_, result, distance, place, score, seconds),) = parse_episodes(out)
+    assert (result, distance, place, score) == ("success", "0.000", "line", "1.00")
+    assert float(seconds) < 6
+    assert out.splitlines()[-1] == "push.mp4"
+    assert list(tree(tmp_path)) == ["push.mp4"]
+    with imageio.get_reader("push.mp4") as film:
+        frames, fps = film.count_frames(), film.get_meta_data()["fps"]
+    assert fps == 25
+    assert 0 <= frames / fps - float(seconds) <= 0.08
+
+
+def test_baselines_play_with_goals_that_are_poses(ok):
+    words = ("play", "reach", "arm3-stick", "--policy", "ik", "--sim", "mujoco", "--goal", "pose")
+    out = ok(*words)
+    result, angle = re.match(r"episode 1: (\w+), .* m and (.*) degrees from the goal", out).groups()
+    assert result == "success"
+    assert float(angle) < 10
+
+
+def test_episodes_differ_and_are_reproducible(run):
+    words = ("play", "reach", "arm3-stick", "--sim", "mujoco", "--episodes", "2", "--obstacles")
+    outs = [run(*words, "--seed", seed, "--kind", "discrete")[1] for seed in (1, 1, 2)]
+    assert outs[0] == outs[1] != outs[2]
+    first, second = parse_episodes(outs[0])
+    assert first[2:] != second[2:]
+
+
+@pytest.mark.slow
+def test_zero_policy_does_not_move(ok):
+    out = ok("play", "push", "prims", "--policy", "zero", "--sim", "mujoco")
+    ((_, result, distance, _, score, seconds),) = parse_episodes(out)
+    assert (result, score, seconds) == ("failure", "0.00", "6.00")
+    assert 0.3 < float(distance) < 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sim", [PYBULLET, "mujoco", "kinematic"])
+def test_speed_prints_rates_and_shares(sim, ok):
+    words = ["speed", "reach", "arm3", "--envs", "2", "--seconds", "0.05", "--sim", sim]
+    facts = json.loads(ok(*words, "--json"))
+    assert facts["steps_per_second"] > 0
+    assert sum(facts["shares"].values()) == pytest.approx(1)
+    assert facts["shares"]["simulator"] > 0
+    text = ok(*words)
+    assert f"reach, arm3, 2 environments, {sim}, cpu, 1 worker(s)" in text
+    assert "physics steps per second" in text
+
+
+def test_robots_above_the_default_max_links_can_be_measured(ok):
+    words = ["speed", "reach", "chain", "beads=7", "--envs", "1", "--seconds", "0.05"]
+    assert "reach, chain" in ok(*words, "--sim", "mujoco")
+
+
+@pytest.mark.parametrize("name", POLICIES.builtin)
+def test_shipped_policies_are_small_and_act_on_any_robot(name):
+    policy = POLICIES[name]
+    run_config, learner = read_checkpoint(policy.file)
+    assert policy.file.stat().st_size < 2e6
+    assert run_config.interface.max_links is None
+    assert run_config.source.grammars, "it was trained on drawn robots alone"
+    assert learner["update"] == run_config.num_updates
+    for task in ("reach", "push"):
+        assert (name in policies_for(task)) == (task in policy.tasks)
+        assert (task in policy.tasks) == (task == run_config.source.task)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("options", "controllers"),
+    [
+        ("--obstacles", ["zero-shot-obstacles", "ik", "jacobian", "random"]),
+        ("--goal pose", ["zero-shot-pose", "ik", "jacobian", "random"]),
+        ("--goal pose --obstacles", ["zero-shot-pose-obstacles", "ik", "jacobian", "random"]),
+        ("--task push", ["zero-shot-push", "scripted", "random"]),
+        ("--task door", ["zero-shot-door", "scripted", "random"]),
+    ],
+)
+def test_each_variant_has_a_policy_and_controllers_to_compare(options, controllers, ok):
+    out = ok("zeroshot", "ur5-stick", *options.split(), "--episodes", "1")
+    head, _, *rows = out.splitlines()
+    assert [row.split()[0] for row in rows] == controllers
+    assert ("angle" in head) == ("pose" in options)
+    assert ("score" in head) == ("push" not in options)
+
+
+def test_results_are_beside_controllers_that_do_not_learn(ok):
+    rows = json.loads(ok("zeroshot", "arm3-stick", "--episodes", "2", "--json"))
+    assert [row["controller"] for row in rows] == ["zero-shot", "ik", "jacobian", "random"]
+    for row in rows:
+        assert row["episodes"] == 2
+        assert row["success"]["low"] <= row["success"]["value"] <= row["success"]["high"]
+
+
+def test_a_table_follows_the_episodes_of_each_controller(run, monkeypatch):
+    for name in ("FIRST_LINE", "LINE_INTERVAL"):
+        monkeypatch.setattr(progress, name, -1.0)
+    code, out, err = run("zeroshot", "arm3-stick", "--episodes", "2")
+    controllers = ["zero-shot", "ik", "jacobian", "random"]
+    head, _, *rows = out.splitlines()
+    assert (code, head.split()) == (0, ["controller", "success", "distance", "[m]", "score"])
+    assert [row.split()[0] for row in rows] == controllers
+    assert float(rows[1].split()[-2]) < 0.03 < float(rows[-1].split()[-2])  # ik, random [m]
+    assert float(rows[-1].split()[-1]) == 0  # scores are relative to it
+    ended = re.findall(r"(?m)^(\S+): 2 of 2 episodes, \d+ s$", err)
+    assert list(dict.fromkeys(ended)) == controllers
+
+
+def test_a_shipped_policy_is_named_like_a_checkpoint(ok, run, tmp_path):
+    words = ["zero-shot", "--split", "interpolation/arm3/reach", "--on", "test", "--sim", "mujoco"]
+    out = ok("eval", *words, "--episodes", "1", "--mode", "deterministic", "--json")
+    (score,) = json.loads(out)["deterministic"]
+    assert score["episodes"] == 1
+    few = ["--steps", "64", "--envs", "2", "--set", "num_steps=8", "--set", "minibatches=2"]
+    assert run("finetune", *words, *few, "--no-tensorboard", "--out", tmp_path)[0] == 0
+    tuned, _ = read_checkpoint(tmp_path / "checkpoint.pt")
+    assert tuned.initial_checkpoint == str(POLICIES["zero-shot"].file)
+
+
+def test_other_packages_register_policies(monkeypatch, ok):
+    monkeypatch.setattr(POLICIES, "_loaded", {})
+    POLICIES.register(ShippedPolicy("mine", POLICIES["zero-shot"].file, ("reach",)))
+    poses = ("zero-shot-pose", "zero-shot-pose-obstacles")
+    assert policies_for("reach")[-5:] == ("zero-shot", "zero-shot-obstacles", *poses, "mine")
+    words = ["arm=arm3", "ee=stick", "--policy", "mine", "--sim", "mujoco"]
+    assert "episode 1" in ok("play", "reach", *words)
+
+
+@pytest.mark.slow
+def test_the_shipped_policy_reaches_with_real_arms(ok):
+    policy, ik, _, random = json.loads(ok("zeroshot", "ur5-stick", "--episodes", "40", "--json"))
+    assert policy["success"]["low"] > 0.5 > random["success"]["high"]
+    assert ik["success"]["value"] == 1

@@ -1,5 +1,9 @@
-"""Searching for primitives that fit a solid: what is found, its score, and the sampled points."""
+"""Search for primitives: enclosing ones, spheres, their quality."""
 
+from __future__ import annotations
+
+import itertools
+import math
 import os
 import subprocess
 import sys
@@ -8,10 +12,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from scipy.integrate import dblquad
+from scipy.spatial.transform import Rotation
 
-from morphgen.errors import FitError
-from morphgen.fitting.canonical import KINDS
-from morphgen.fitting.quality import quality
+from helpers.robots import arm
+from morphgen.errors import FitError, FormatError
+from morphgen.fitting.canonical import KINDS, Kind
+from morphgen.fitting.enclose import enclose
+from morphgen.fitting.link_fit import FitOptions, fit_shapes
+from morphgen.fitting.quality import Quality, quality, signed_distance
+from morphgen.fitting.replace_collision import as_spheres, has_only_spheres, link_spheres
 from morphgen.fitting.search import (
     DIGITS,
     MIN_POINTS,
@@ -21,13 +31,29 @@ from morphgen.fitting.search import (
     ascend,
     best_several,
     best_single,
+    best_spheres,
     by_growth,
     by_pieces,
     covered,
     sample_solid,
 )
-from morphgen.fitting.solid import solid_of, solid_of_mesh
-from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere, dimensions
+from morphgen.fitting.solid import Solid, solid_of, solid_of_mesh
+from morphgen.fitting.token_shapes import token_shapes
+from morphgen.grammar.library import default_library
+from morphgen.grammar.part import load_part
+from morphgen.model.geometry import (
+    Box,
+    Capsule,
+    Cylinder,
+    Mesh,
+    Pose,
+    Shape,
+    Sphere,
+    dimensions,
+    volume,
+)
+from morphgen.model.inertia import solid_mesh
+from morphgen.typing import Array
 
 TILTED = Pose.from_xyz_rpy((0.1, -0.2, 0.3), (0.4, 0.7, -1.1))
 PRIMITIVES = (Box((0.1, 0.2, 0.4)), Cylinder(0.06, 0.3), Sphere(0.1))
@@ -170,3 +196,517 @@ def test_a_point_at_the_centre_has_finite_gradients(kind):
     moved = ascend(start, cloud, Round(None, 501, 5, (0.03, 0.002), (0.01, 0.0005)))
     assert np.isfinite([*moved.centres[0, 0], *moved.quaternions[0, 0]]).all()
     assert (moved.halves > 0).all()
+
+
+GEOMETRY: dict[Kind, type] = {"box": Box, "cylinder": Cylinder, "sphere": Sphere}
+CUBE = np.array(list(itertools.product((0.0, 0.1), repeat=3)))
+ROUNDING = 1.001
+
+
+def outside(shape: Shape, points: Array) -> float:
+    """Return the largest signed distance of points to a shape [m]."""
+    return float(signed_distance([shape], points).max())
+
+
+def size(shape: Shape) -> float:
+    assert isinstance(shape.geometry, (Box, Cylinder, Sphere))
+    return volume(shape.geometry)
+
+
+def surface(kind: Kind, rng: np.random.Generator) -> tuple[Array, float]:
+    """Points of a randomly placed primitive of random size, and its volume."""
+    a, b, c = np.exp(rng.uniform(-3, -0.5, 3))
+    if kind == "box":
+        mesh, truth = trimesh.creation.box((a, b, c)).subdivide(), a * b * c
+    elif kind == "cylinder":
+        mesh, truth = trimesh.creation.cylinder(a, b, sections=60), math.pi * a**2 * b
+    else:
+        mesh, truth = trimesh.creation.icosphere(2, a), 4 / 3 * math.pi * a**3
+    turn = Rotation.from_rotvec(rng.uniform(-3, 3, 3)).as_matrix()
+    return mesh.vertices @ turn.T + rng.uniform(-1, 1, 3), truth
+
+
+def cloud(rng: np.random.Generator, n: int = 40) -> Array:
+    stretched = rng.normal(size=(n, 3)) * np.exp(rng.uniform(-3, 0, 3))
+    turn = Rotation.from_rotvec(rng.uniform(-3, 3, 3)).as_matrix()
+    return np.asarray(stretched @ turn.T + rng.uniform(-2, 2, 3))
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_turned_primitive_is_recovered(kind: Kind, seed: int) -> None:
+    points, truth = surface(kind, np.random.default_rng(seed))
+    shape = enclose(points)
+    assert isinstance(shape.geometry, GEOMETRY[kind])
+    assert size(shape) == pytest.approx(truth, rel=5e-3)
+    assert outside(shape, points) <= 1e-9
+
+
+def test_a_primitive_aligned_with_the_link_axes_stays_aligned() -> None:
+    centre = np.array([0.5, 0.0, -0.2])
+    box = enclose(np.asarray(trimesh.creation.box((0.1, 0.2, 0.3)).vertices) + centre)
+    assert box.geometry == Box((0.1, 0.2, 0.3))
+    assert box.T_link_shape.position == (0.5, 0.0, -0.2)
+    assert box.T_link_shape.quaternion == (1.0, 0.0, 0.0, 0.0)
+    points = np.asarray(trimesh.creation.box((0.1, 0.2, 0.3)).subdivide().vertices)
+    noise = np.random.default_rng(0).uniform(-1e-7, 1e-7, points.shape)
+    assert enclose(points + noise).T_link_shape.quaternion == (1.0, 0.0, 0.0, 0.0)
+
+    upright = np.asarray(trimesh.creation.cylinder(0.1, 0.5).vertices)
+    cylinder = enclose(upright + centre)
+    assert cylinder.geometry == Cylinder(0.1, 0.5)
+    assert cylinder.T_link_shape == box.T_link_shape
+    half = math.sqrt(0.5)
+    lying = enclose(upright[:, [2, 0, 1]] + centre)
+    assert lying.geometry == Cylinder(0.1, 0.5)
+    assert lying.T_link_shape.quaternion == pytest.approx((half, 0.0, half, 0.0))
+
+    sphere = enclose(np.asarray(trimesh.creation.icosphere(2, 0.1).vertices) + centre)
+    assert sphere == Shape(Sphere(0.1), box.T_link_shape)
+
+
+@pytest.mark.parametrize(("seed", "scale"), [(0, 1.0), (3, 1e-4)])
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_encloses_all_points_after_rounding(kind: Kind, seed: int, scale: float) -> None:
+    points = scale * cloud(np.random.default_rng(seed))
+    shape = enclose(points, [kind])
+    assert isinstance(shape.geometry, GEOMETRY[kind])
+    assert outside(shape, points) <= 1e-9
+    assert outside(shape, points) > -3e-6, "a point must touch it"
+    pose = shape.T_link_shape
+    for value in (*dimensions(shape.geometry), *pose.position):
+        assert value == round(value, 6)
+    assert np.linalg.norm(pose.quaternion) == pytest.approx(1.0, abs=1e-15)
+    assert pose.quaternion == pytest.approx(np.round(pose.quaternion, 9), abs=2e-9)
+    assert pose.quaternion[0] >= 0
+
+
+def test_enclosures_of_links_are_not_larger_than_those_of_trimesh() -> None:
+    arm = load_part(default_library(()).manifest("panda")).fragment
+    for name in ("panda_link3", "panda_link4"):  # whose trimesh cylinder is a sixth too large
+        mesh = solid_of(arm.link(name).collisions).mesh
+        _, extents = trimesh.bounds.oriented_bounds(mesh)
+        cylinder = trimesh.bounds.minimum_cylinder(mesh)
+        _, radius = trimesh.nsphere.minimum_nsphere(mesh)
+        tightest = min(
+            volume(Box(tuple(extents))),
+            volume(Cylinder(cylinder["radius"], cylinder["height"])),
+            volume(Sphere(radius)),
+        )
+        shape = enclose(mesh.vertices)
+        assert size(shape) <= tightest * ROUNDING
+        assert outside(shape, np.asarray(mesh.vertices)) <= 1e-9
+
+
+def test_the_smallest_box_of_a_regular_tetrahedron_is_a_cube() -> None:
+    corners = CUBE[[0, 3, 5, 6]]
+    turn = Rotation.from_rotvec([0.3, 1.1, -0.4]).as_matrix()
+    assert size(enclose(corners @ turn.T, ["box"])) == pytest.approx(1e-3, rel=1e-3)
+    sphere = enclose(corners @ turn.T, ["sphere"]).geometry
+    assert isinstance(sphere, Sphere)
+    assert sphere.radius == pytest.approx(0.05 * math.sqrt(3), abs=2e-6)
+
+
+def smallest_sphere(points: Array) -> float:
+    """Return the radius by enumerating all spheres through two to four points."""
+    radii = []
+    for n in (2, 3, 4):
+        for some in itertools.combinations(range(len(points)), n):
+            spokes = points[list(some[1:])] - points[some[0]]
+            weights = np.linalg.lstsq(spokes @ spokes.T, (spokes**2).sum(axis=1) / 2, rcond=None)[0]
+            centre = points[some[0]] + weights @ spokes
+            radii.append(np.linalg.norm(points - centre, axis=1).max())
+    return float(min(radii))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_sphere_is_the_minimum_enclosing_sphere(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(8, 3))
+    if seed % 3 == 1:
+        points = points.round()
+    if seed % 3 == 2:
+        points /= np.linalg.norm(points, axis=1, keepdims=True)
+    sphere = enclose(points, ["sphere"]).geometry
+    assert isinstance(sphere, Sphere)
+    assert sphere.radius == pytest.approx(smallest_sphere(points), abs=3e-6)
+
+
+def test_the_smallest_of_several_kinds_is_returned() -> None:
+    points = cloud(np.random.default_rng(7))
+    alone = {kind: enclose(points, [kind]) for kind in KINDS}
+    assert enclose(points) == min(alone.values(), key=size)
+    rest = ("sphere", "box")
+    assert enclose(points, rest) == min((alone[kind] for kind in rest), key=size)
+
+
+def test_the_result_is_deterministic_and_independent_of_interior_points() -> None:
+    rng = np.random.default_rng(8)
+    points = cloud(rng)
+    shape = enclose(points)
+    assert enclose(points.copy()) == shape
+    inner = rng.dirichlet(np.ones(len(points)), 500) @ points
+    assert enclose(np.concatenate([points, inner, points])) == shape
+
+
+def test_a_dense_round_hull_is_enclosed_tightly() -> None:
+    egg = np.asarray(trimesh.creation.icosphere(5).vertices) * (0.3, 0.2, 0.1)
+    assert len(egg) > 10_000
+    turn = Rotation.from_rotvec([0.5, 0.2, 1.0]).as_matrix()
+    shape = enclose(egg @ turn.T, ["box"])
+    assert outside(shape, egg @ turn.T) <= 1e-9
+    assert size(shape) <= 0.6 * 0.4 * 0.2 * ROUNDING
+
+
+@pytest.mark.parametrize(
+    ("points", "reason"),
+    [
+        (np.zeros((0, 3)), "0 points"),
+        (np.ones((9, 3)), "1 points are distinct"),
+        (np.eye(3)[[0, 1, 2, 0, 1, 2]], "3 points are distinct"),
+        (np.stack([np.arange(5.0)] * 3, axis=1), "flat"),
+        (np.insert(np.random.default_rng(0).normal(size=(50, 2)), 1, 3.0, axis=1), "flat"),
+        (np.vstack([CUBE, [0.0, 0.0, np.nan]]), "not finite"),
+    ],
+)
+def test_points_without_volume_are_an_error(points: Array, reason: str) -> None:
+    with pytest.raises(FitError, match=reason):
+        enclose(points)
+    with pytest.raises(ValueError, match=r"\(8, 2\); expected \(n, 3\)"):
+        enclose(CUBE[:, :2])
+
+
+BALLS = ((0.1, 0.0, 0.0, 0.05), (-0.02, 0.03, 0.0, 0.07), (0.0, -0.04, 0.1, 0.04))
+BOX = (0.3, 0.1, 0.08)
+BEST_GRID = 2.01  # volume ratio of eight equal balls on the best grid that cover the box
+
+
+def spheres_of(shapes):
+    """Centres and radii, shape (n, 4), sorted by x."""
+    rows = [(*shape.T_link_shape.position, shape.geometry.radius) for shape in shapes]
+    return np.array(sorted(rows))
+
+
+def covered_by(spheres, points):
+    """Which points are in any sphere, by brute force."""
+    distance = np.linalg.norm(points[:, None] - spheres[None, :, :3], axis=2)
+    return (distance <= spheres[:, 3]).any(axis=1)
+
+
+def volume_of(spheres, rng):
+    """Volume of the union, by counting random points."""
+    low, high = (spheres[:, :3] - spheres[:, 3:]).min(0), (spheres[:, :3] + spheres[:, 3:]).max(0)
+    return covered_by(spheres, rng.uniform(low, high, (200_000, 3))).mean() * np.prod(high - low)
+
+
+def test_balls_are_found_again():
+    shapes = [Shape(Sphere(r), Pose((x, y, z))) for x, y, z, r in BALLS]
+    found = best_spheres(sample_solid(solid_of(shapes), 0), len(BALLS), None, 0)
+    assert found.iou > 0.97
+    np.testing.assert_allclose(spheres_of(found.shapes), sorted(BALLS), atol=1.5e-3)
+
+
+@pytest.mark.parametrize("share", [pytest.param(0.98, marks=pytest.mark.slow), 0.995])
+def test_spheres_cover_the_share_of_a_box_that_they_must(share):
+    fit = fit_shapes([Shape(Box(BOX))], FitOptions(spheres=8, cover=share))
+    spheres = spheres_of(fit.primitives)
+    assert len(spheres) == 8
+    rng = np.random.default_rng(5)
+    inside = covered_by(spheres, rng.uniform(-0.5, 0.5, (200_000, 3)) * BOX).mean()
+    assert share - 1e-3 < inside < share + (1 - share) / 2
+    volume_ratio = volume_of(spheres, rng) / np.prod(BOX)
+    assert volume_ratio < 0.9 * BEST_GRID
+    assert volume_ratio == pytest.approx(fit.quality.volume_ratio, rel=0.01)
+    assert inside == pytest.approx(fit.quality.coverage, abs=1e-3)
+
+
+def test_protruding_share_of_a_ball_around_a_cube():
+    """A sphere of radius r around a cube of edge 2a has six caps of height r - a outside of it."""
+    a, r = 0.05, 0.06
+    measured = quality(solid_of([Shape(Box((2 * a,) * 3))]), [Shape(Sphere(r))])
+    assert measured.protrusion_share == pytest.approx(6 * (r - a) / (2 * r), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"spheres": 0}, "0 spheres: expected 1 to 32"),
+        ({"spheres": 4, "enclose": True}, "neither max_primitives nor enclose"),
+        ({"cover": 0.9}, "cover 0.9: expected a number of spheres"),
+        ({"spheres": 4, "cover": 1.0}, "cover 1: expected more than 0, at most 0.9999"),
+        ({"spheres": 4, "cover": float("nan")}, "cover nan"),
+        ({"max_primitives": 0}, "0 primitives: expected 1 to 32"),
+        ({"iou": 1.5}, "IoU 1.5"),
+        ({"seed": -1}, "seed -1"),
+    ],
+)
+def test_invalid_options_are_refused(options, message):
+    with pytest.raises(FitError, match=message):
+        FitOptions(**options)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A robot of a mesh in millimetres, a rod and a link without shapes, and its spheres."""
+    folder = tmp_path_factory.mktemp("spheres")
+    trimesh.creation.box((100.0, 100.0, 40.0)).export(folder / "block.stl")
+    block = Shape(Mesh(folder / "block.stl", (1e-3, 1e-3, 1e-3)))
+    base, upper, lower, *_ = arm().links
+    links = (replace(base, collisions=(block,)), upper, replace(lower, collisions=()))
+    robot = replace(arm(), links=links, joints=arm().joints[:2], frames=(), home=(0.4, 0.5))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(folder))
+        yield robot, as_spheres(robot, spheres=3, cover=0.9)
+
+
+@pytest.fixture
+def no_search(monkeypatch):
+    def forbidden(*_, **__):
+        raise AssertionError("links were fitted again")
+
+    monkeypatch.setattr("morphgen.fitting.robot_fit.fit_links", forbidden)
+
+
+def test_robots_get_spheres_and_keep_everything_else(made):
+    meshed, robot = made
+    assert [len(link.collisions) for link in robot.links] == [3, 3, 0]
+    assert all(has_only_spheres(link.collisions) for link in robot.links[:2])
+    assert [spheres.link for spheres in link_spheres(robot)] == ["base", "upper"]
+    for before, after in zip(meshed.links, robot.links, strict=True):
+        assert after.inertial.mass == pytest.approx(before.inertial.mass)
+        assert len(after.visuals) == len(before.visuals)
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (20_000, 3)) * (0.1, 0.1, 0.04)
+    assert 0.89 < covered_by(spheres_of(robot.root.collisions), points).mean() < 0.96
+
+
+def test_spheres_are_fitted_once(made, no_search):
+    meshed, robot = made
+    again = as_spheres(meshed, spheres=3, cover=0.9)
+    assert again.ignore_pairs == robot.ignore_pairs
+    for kept in (again, as_spheres(robot, spheres=5)):  # links of spheres keep them
+        assert [link.collisions for link in kept.links] == [link.collisions for link in robot.links]
+    for other in ({"spheres": 3}, {"spheres": 2, "cover": 0.9}, {"spheres": 3, "cover": 0.8}):
+        with pytest.raises(AssertionError, match="again"):
+            as_spheres(meshed, **other)
+
+
+def test_tokens_of_a_robot_with_spheres_are_those_of_its_shapes(made):
+    meshed, robot = made
+    tokens = token_shapes(meshed)
+    assert token_shapes(robot) == tokens
+    assert token_shapes(as_spheres(robot)) == tokens
+
+
+def test_faults_of_the_cache_are_reported(made, tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    robot = replace(made[0], links=made[0].links[:1], joints=(), home=())
+    as_spheres(robot, spheres=1)
+    (path,) = tmp_path.rglob("spheres*/*.json")
+    path.write_text("{")
+    with pytest.raises(FormatError, match="delete the file"):
+        as_spheres(robot, spheres=1)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(path))
+    as_spheres(robot, spheres=1)
+    assert f"cannot keep fits in {path}/morphgen/" in caplog.text
+
+
+BLOCK = Shape(Box((0.4, 0.2, 0.1)))
+UNIT_CUBE = Shape(Box((0.2, 0.2, 0.2)))
+TILTED_POSE = Pose.from_xyz_rpy((0.3, -0.2, 0.5), (0.4, -1.1, 2.0))
+GEOMETRY_KINDS = [Box((0.3, 0.2, 0.4)), Cylinder(0.15, 0.3), Sphere(0.2), Capsule(0.1, 0.25)]
+DISTANCES = ("protrusion_mean", "protrusion_p95", "gap_mean", "gap_p95", "hausdorff")
+SHARES = ("iou", "coverage", "volume_ratio")
+
+
+def at(x: float, y: float = 0.0, z: float = 0.0) -> Pose:
+    return Pose((x, y, z))
+
+
+def solid(*pieces: tuple[Box, Pose]) -> Solid:
+    return solid_of([Shape(box, pose) for box, pose in pieces])
+
+
+def assert_perfect(found: Quality) -> None:
+    assert [getattr(found, name) for name in SHARES] == [1.0, 1.0, 1.0]
+    assert max(getattr(found, name) for name in DISTANCES) < 1e-7
+
+
+@pytest.mark.parametrize(
+    ("geometry", "point", "expected"),
+    [
+        (Box((2, 4, 6)), (0, 0, 0), -1),
+        (Box((2, 4, 6)), (0.5, 1.9, 0), -0.1),
+        (Box((2, 4, 6)), (4, 6, 0), 5),
+        (Sphere(2), (0, 3, 4), 3),
+        (Sphere(2), (0, 0, 0.5), -1.5),
+        (Cylinder(1, 6), (0.6, 0.8, 2), 0),
+        (Cylinder(1, 6), (0, 0, 2.5), -0.5),
+        (Cylinder(1, 6), (4, 0, -7), 5),
+        (Capsule(1, 6), (0, 0, 3.5), -0.5),
+        (Capsule(1, 6), (0.25, 0, 1), -0.75),
+        (Capsule(1, 6), (3, 0, 7), 4),
+    ],
+)
+@pytest.mark.parametrize("pose", [Pose(), TILTED_POSE])
+def test_signed_distances_of_one_primitive_are_exact(geometry, point, expected, pose):
+    distances = signed_distance([Shape(geometry, pose)], np.array([pose.apply(point)]))
+    assert distances == pytest.approx([expected], abs=1e-12)
+
+
+def test_the_signed_distance_of_a_union_is_that_of_the_nearest_primitive():
+    pair = [Shape(Box((2, 2, 2)), at(-0.5)), Shape(Box((2, 2, 2)), at(0.5))]
+    distances = signed_distance(pair, np.array([[3, 0, 0], [-4.5, 0, 5], [0, 0, 0], [0, 0, 0.9]]))
+    np.testing.assert_allclose(distances, [1.5, 5, -0.5, -0.1], atol=1e-12)
+    crossed = [Shape(Box((2, 2, 2)), at(-0.8)), Shape(Box((2, 2, 2)), at(0.8))]
+    assert signed_distance(crossed, np.zeros((1, 3))) == pytest.approx([-0.2])
+
+
+@pytest.mark.parametrize("shape", [BLOCK, UNIT_CUBE, Shape(Box((0.1, 0.2, 0.3)), TILTED_POSE)])
+def test_a_box_is_a_perfect_fit_of_itself(shape):
+    assert_perfect(quality(solid_of([shape]), [shape]))
+
+
+def test_a_box_a_tenth_too_long_protrudes_by_the_excess():
+    measures = quality(solid_of([BLOCK]), [Shape(Box((0.44, 0.2, 0.1)), at(0.02))])
+    assert measures.iou == pytest.approx(1 / 1.1, abs=1e-4)
+    assert measures.coverage == 1
+    assert measures.volume_ratio == pytest.approx(1.1, abs=1e-4)
+    area = 2 * (0.44 * 0.2 + 0.2 * 0.1 + 0.1 * 0.44)
+    end, strips = 0.2 * 0.1 * 0.04, 2 * (0.2 + 0.1) * 0.04 * 0.02
+    assert measures.protrusion_mean == pytest.approx((end + strips) / area, rel=5e-3)
+    assert measures.protrusion_p95 == pytest.approx(0.04, abs=1e-9)
+    assert measures.gap_mean == measures.gap_p95 == 0
+    assert measures.hausdorff == pytest.approx(0.04, abs=1e-9)
+
+
+def test_a_sphere_in_a_cube_does_not_cover_the_corners():
+    measures = quality(solid_of([UNIT_CUBE]), [Shape(Sphere(0.1))])
+    assert measures.iou == measures.coverage == measures.volume_ratio
+    assert measures.iou == pytest.approx(math.pi / 6, abs=1e-3)
+    assert measures.protrusion_mean == pytest.approx(0, abs=1e-9)
+    away, _ = dblquad(lambda y, x: math.sqrt(1 + x * x + y * y), 0, 1, 0, 1)
+    assert measures.gap_mean == pytest.approx(0.1 * (away - 1), rel=0.02)
+    assert measures.hausdorff == pytest.approx(0.1 * (math.sqrt(3) - 1), abs=1e-9)
+
+
+def test_a_cylinder_fits_its_tessellation_up_to_the_sagitta():
+    shape = Shape(Cylinder(0.05, 0.2), TILTED_POSE)
+    measures = quality(solid_of([shape]), [shape])
+    assert measures.iou == pytest.approx(48 / math.tau * math.sin(math.tau / 48), abs=5e-4)
+    assert measures.coverage == pytest.approx(1, abs=1e-4)
+    sagitta = 0.05 * (1 - math.cos(math.pi / 48))
+    assert measures.hausdorff == pytest.approx(sagitta, rel=0.02)
+    assert 0 < measures.protrusion_p95 <= sagitta + 1e-9
+    assert measures.gap_mean < 1e-9
+
+
+@pytest.mark.parametrize("shift", [0.05, 0.1])
+def test_the_overlap_of_two_boxes_is_counted_once(shift):
+    pair = [Shape(Box((0.2, 0.2, 0.1)), at(-shift)), Shape(Box((0.2, 0.2, 0.1)), at(shift))]
+    assert_perfect(quality(solid((Box((0.2 + 2 * shift, 0.2, 0.1)), Pose())), pair))
+
+
+@pytest.mark.parametrize(
+    "idle",
+    [Shape(Sphere(0.09)), Shape(Box((0.2, 0.2, 0.1)), at(0, 0, 0.05)), UNIT_CUBE],
+    ids=["within", "flush", "equal"],
+)
+def test_a_primitive_inside_another_changes_nothing(idle):
+    small = solid((Box((0.04, 0.04, 0.04)), at(0, 0, -0.06)))
+    once = quality(small, [UNIT_CUBE])
+    for both in ([UNIT_CUBE, idle], [idle, UNIT_CUBE]):
+        measures = quality(small, both)
+        for name in SHARES + DISTANCES:
+            assert getattr(measures, name) == pytest.approx(getattr(once, name), rel=5e-3, abs=1e-9)
+
+
+def test_protrusion_of_a_thin_skin_equals_its_thickness():
+    skin = 1e-4
+    pair = [
+        Shape(Box((0.3 + skin, 0.2 + 2 * skin, 0.1 + 2 * skin)), at(sign * (0.05 + skin / 2)))
+        for sign in (-1, 1)
+    ]
+    measures = quality(solid_of([BLOCK]), pair)
+    assert measures.coverage == 1
+    assert measures.protrusion_mean == pytest.approx(skin, rel=0.01)
+    assert measures.hausdorff == pytest.approx(math.sqrt(3) * skin, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    "geometry",
+    [Capsule(0.01, 0.03), Capsule(0.001, 0.1), Cylinder(1e-4, 0.1), Cylinder(0.05, 1e-6)],
+)
+@pytest.mark.parametrize("count", [1, 2])
+def test_thin_primitives_are_measured(geometry, count):
+    shape = Shape(geometry)
+    measures = quality(solid_of([UNIT_CUBE]), [shape] * count)
+    corner = signed_distance([shape], np.full((1, 3), 0.1))
+    assert measures.hausdorff == pytest.approx(corner[0])
+    assert measures.protrusion_share == 0
+
+
+def test_disjoint_shapes_have_no_overlap():
+    measures = quality(solid_of([UNIT_CUBE]), [Shape(UNIT_CUBE.geometry, at(0.5))])
+    assert measures.iou == measures.coverage == 0
+    assert measures.volume_ratio == pytest.approx(1, rel=1e-3)
+    assert measures.hausdorff == pytest.approx(0.5, abs=1e-9)
+    assert 0.3 < measures.gap_mean == pytest.approx(measures.protrusion_mean, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "primitives",
+    [
+        [UNIT_CUBE],
+        [Shape(Box((0.11, 0.2, 0.2)), at(-0.045)), Shape(Box((0.12, 0.2, 0.2)), at(0.04))],
+    ],
+)
+def test_the_hausdorff_distance_of_a_filled_slot_is_its_depth(primitives):
+    slotted = solid(
+        (Box((0.096, 0.2, 0.2)), at(-0.052)),
+        (Box((0.096, 0.2, 0.2)), at(0.052)),
+        (Box((0.2, 0.2, 0.02)), at(0, 0, -0.09)),
+    )
+    measures = quality(slotted, primitives)
+    assert measures.iou == pytest.approx(1 - 0.008 * 0.18 / 0.04, abs=1e-3)
+    assert measures.protrusion_p95 < 1e-7
+    assert measures.protrusion_mean < 1e-4
+    assert measures.hausdorff == pytest.approx(0.096, abs=2e-4)
+
+
+@pytest.mark.parametrize("geometry", GEOMETRY_KINDS)
+def test_surfaces_are_sampled_uniformly(geometry):
+    kernel = Shape(Box((0.02, 0.05, 0.01)), TILTED_POSE @ at(0.05, 0.02, 0.03))
+    small = solid_of([kernel])
+    measures = quality(small, [Shape(geometry, TILTED_POSE)])
+    mesh = solid_mesh(geometry).copy()
+    for _ in range(2 if isinstance(geometry, Sphere) else 0):
+        mesh = mesh.subdivide()
+    mesh.apply_transform(TILTED_POSE.matrix)
+    points, _ = trimesh.sample.sample_surface(mesh, 40_000, seed=3)
+    distance = small.distance(np.asarray(points))
+    assert measures.protrusion_mean == pytest.approx(distance.mean(), rel=0.01)
+    assert measures.protrusion_p95 == pytest.approx(np.percentile(distance, 95), rel=0.01)
+    assert measures.coverage == 1
+
+
+def test_measures_are_reproducible_and_sampling_errors_are_small():
+    ball = [Shape(Sphere(0.1))]
+    cube = solid_of([UNIT_CUBE])
+    measures = [quality(cube, ball, seed=seed) for seed in range(8)]
+    assert quality(cube, ball, seed=3) == measures[3]
+    assert len({each.gap_mean for each in measures}) == len(measures)
+    error = np.array([each.iou for each in measures]) - math.pi / 6
+    assert np.abs(error).max() < 2e-3
+    assert quality(cube, ball, volume_points=1000) == quality(cube, ball, volume_points=1024)
+
+
+def test_meshes_empty_lists_and_flat_boxes_are_errors(tmp_path):
+    cube = solid_of([UNIT_CUBE])
+    for wrong in ([], [UNIT_CUBE, Shape(Mesh(tmp_path / "a.stl"))], [Shape(Box((1, 0, 1)))]):
+        with pytest.raises(ValueError, match="primitive"):
+            quality(cube, wrong)
+        with pytest.raises(ValueError, match="primitive"):
+            signed_distance(wrong, np.zeros((1, 3)))
+    speck = solid((Box((1e-3, 1e-3, 1e-3)), Pose()))
+    with pytest.raises(FitError, match="none of 64 sample points"):
+        quality(speck, [Shape(Sphere(1.0), at(5))], volume_points=64)

@@ -154,12 +154,12 @@ def written(tmp_path_factory):
 
 
 @pytest.fixture
-def folder_bundle_fits(written, tmp_path):
+def bundle_folder(written, tmp_path):
     return shutil.copytree(written, tmp_path / "ur5")
 
 
-def test_a_bundle_contains_the_fits_of_its_parts(folder_bundle_fits):
-    back = read_bundle(folder_bundle_fits)
+def test_a_bundle_contains_the_fits_of_its_parts(bundle_folder):
+    back = read_bundle(bundle_folder)
     assert token_shapes(back) == token_shapes(ROBOT)
     ours, theirs = (
         [link.collisions for link in as_primitives(each, ()).links] for each in (ROBOT, back)
@@ -176,43 +176,43 @@ def test_token_shapes_do_not_depend_on_the_collision_geometry(tmp_path):
     )
 
 
-def test_fits_are_kept_when_a_bundle_is_rewritten(folder_bundle_fits, tmp_path):
-    again = write_bundle(read_bundle(folder_bundle_fits), tmp_path / "again", picture=False)
-    assert (again / FITS).read_bytes() == (folder_bundle_fits / FITS).read_bytes()
+def test_fits_are_kept_when_a_bundle_is_rewritten(bundle_folder, tmp_path):
+    again = write_bundle(read_bundle(bundle_folder), tmp_path / "again", picture=False)
+    assert (again / FITS).read_bytes() == (bundle_folder / FITS).read_bytes()
 
 
 def test_a_robot_without_meshes_has_no_fits_file(tmp_path):
-    folder_bundle_fits = write_bundle(morphgen.compose("prims"), tmp_path / "prims", picture=False)
-    assert not (folder_bundle_fits / FITS).exists()
+    bundle_folder = write_bundle(morphgen.compose("prims"), tmp_path / "prims", picture=False)
+    assert not (bundle_folder / FITS).exists()
 
 
-def test_an_edited_mesh_does_not_use_the_fit_of_the_original(folder_bundle_fits):
-    link = read_bundle(folder_bundle_fits).link("arm_forearm_link")
+def test_an_edited_mesh_does_not_use_the_fit_of_the_original(bundle_folder):
+    link = read_bundle(bundle_folder).link("arm_forearm_link")
     path = link.collisions[0].geometry.path
     trimesh.creation.box((0.1, 0.2, 0.3)).export(path)
     with pytest.raises(pytest.fail.Exception, match="searched"):
-        token_shapes(read_bundle(folder_bundle_fits))
+        token_shapes(read_bundle(bundle_folder))
 
 
-def test_fits_of_another_fitter_version_are_ignored(folder_bundle_fits):
-    data = json.loads((folder_bundle_fits / FITS).read_text())
-    (folder_bundle_fits / FITS).write_text(json.dumps(data | {"fitter": 1}))
-    assert read_bundle(folder_bundle_fits).fits == {}
+def test_fits_of_another_fitter_version_are_ignored(bundle_folder):
+    data = json.loads((bundle_folder / FITS).read_text())
+    (bundle_folder / FITS).write_text(json.dumps(data | {"fitter": 1}))
+    assert read_bundle(bundle_folder).fits == {}
 
 
-def test_links_to_fits_outside_the_bundle_are_not_followed(folder_bundle_fits, tmp_path):
-    (folder_bundle_fits / FITS).rename(tmp_path / "elsewhere.json")
-    (folder_bundle_fits / FITS).symlink_to(tmp_path / "elsewhere.json")
+def test_links_to_fits_outside_the_bundle_are_not_followed(bundle_folder, tmp_path):
+    (bundle_folder / FITS).rename(tmp_path / "elsewhere.json")
+    (bundle_folder / FITS).symlink_to(tmp_path / "elsewhere.json")
     with pytest.raises(FormatError, match="leaves its folder"):
-        read_bundle(folder_bundle_fits)
+        read_bundle(bundle_folder)
 
 
-def test_invalid_fits_are_an_error_that_names_the_file(folder_bundle_fits):
-    data = json.loads((folder_bundle_fits / FITS).read_text())
+def test_invalid_fits_are_an_error_that_names_the_file(bundle_folder):
+    data = json.loads((bundle_folder / FITS).read_text())
     data["links"][0]["token_iou"] = 7
-    (folder_bundle_fits / FITS).write_text(json.dumps(data))
+    (bundle_folder / FITS).write_text(json.dumps(data))
     with pytest.raises(FormatError, match=rf"{FITS}.*invalid value 7"):
-        read_bundle(folder_bundle_fits)
+        read_bundle(bundle_folder)
 
 
 TILTED = Pose.from_xyz_rpy((0.1, -0.25, 1 / 3), (0.3, -0.5, 2.0))

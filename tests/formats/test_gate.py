@@ -489,7 +489,7 @@ def test_no_number_of_mujocos_schema_takes_the_memory_of_the_machine(tmp_path):
 
 
 BOX = '<robot name="r"><link name="a"><collision><geometry>{}</geometry></collision></link></robot>'
-MESH_HOSTILE_FILES = BOX.format('<mesh filename="{}"/>')
+MESH_URDF = BOX.format('<mesh filename="{}"/>')
 
 
 def chain(links):
@@ -527,8 +527,8 @@ URDFS = {
     ).encode(),
     "unknown links": chain(900).replace('child link="', 'child link="x').encode(),
     "many digits": BOX.format(f'<sphere radius="{"9" * 100_000}"/>').encode(),
-    "nul in a mesh's name": MESH_HOSTILE_FILES.format("%00.stl").encode(),
-    "long mesh name": MESH_HOSTILE_FILES.format("m" * 5000 + ".stl").encode(),
+    "nul in a mesh's name": MESH_URDF.format("%00.stl").encode(),
+    "long mesh name": MESH_URDF.format("m" * 5000 + ".stl").encode(),
 }
 
 
@@ -562,7 +562,7 @@ def test_a_hostile_urdf_is_a_one_line_error(name, tmp_path, capsys):
 
 def test_an_unreadable_mesh_is_a_one_line_error(tmp_path, capsys):
     path = tmp_path / "x.urdf"
-    path.write_text(MESH_HOSTILE_FILES.format("count.stl"))
+    path.write_text(MESH_URDF.format("count.stl"))
     (tmp_path / "count.stl").write_bytes(b"x" * 80 + struct.pack("<I", 2**32 - 1) + bytes(500))
     assert main(["import", str(path), "--out", str(tmp_path / "out"), "--no-picture"]) == 2
     errors = capsys.readouterr().err
@@ -581,7 +581,7 @@ def test_files_that_are_not_regular_are_not_opened(tmp_path, capsys):
     for path in sorted(tmp_path.glob("*.urdf")):
         refused(path, capsys, tmp_path)
     os.mkfifo(tmp_path / "m.stl")
-    (tmp_path / "x.urdf").write_text(MESH_HOSTILE_FILES.format("m.stl"))
+    (tmp_path / "x.urdf").write_text(MESH_URDF.format("m.stl"))
     assert "does not exist" in refused(tmp_path / "x.urdf", capsys, tmp_path)
 
 

@@ -454,7 +454,7 @@ def test_suspicious_expressions_print_no_python_warning():
 
 TEMPLATES = [manifest for manifest in default_library().manifests() if manifest.is_template]
 FINDER = PackageFinder()
-HEAD_XACRO_COMPILE = (
+HEAD_OF_COMPILED = (
     '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="x">'
     '<xacro:arg name="x" default="0.1"/><xacro:property name="x" value="$(arg x)"/>'
 )
@@ -466,7 +466,7 @@ def write(tmp_path):
 
     def written(body):
         path = tmp_path / "x.xacro"
-        path.write_text(f"{HEAD_XACRO_COMPILE}{body}</robot>")
+        path.write_text(f"{HEAD_OF_COMPILED}{body}</robot>")
         return path
 
     return written

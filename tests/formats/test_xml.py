@@ -416,7 +416,7 @@ def touch(path, text=""):
     return path
 
 
-def failure_resolve(uri, base, finder=NOWHERE):
+def failure_of(uri, base, finder=NOWHERE):
     with pytest.raises(FormatError) as caught:
         resolve_uri(uri, base, finder)
     assert "\n" not in str(caught.value)
@@ -474,7 +474,7 @@ def test_files_are_found_by_package_and_spelling(file, uri, tmp_path):
 def test_other_references_are_refused(uri, reason, urdf):
     touch(urdf.parents[2] / "secret.stl")
     touch(urdf.parent / "Base.STL")
-    message = failure_resolve(uri, urdf, PackageFinder((urdf.parents[2] / "root",)))
+    message = failure_of(uri, urdf, PackageFinder((urdf.parents[2] / "root",)))
     assert reason in message
     assert message.startswith(f"{urdf}: ")
 
@@ -485,7 +485,7 @@ def test_a_plain_folder_above_the_description_is_no_package(tmp_path):
     urdf = touch(home / "Downloads" / "robot" / "robot.urdf")
     touch(home / "secret" / "part.stl")
     for uri in ("package://alice/secret/part.stl", "package://secret/part.stl"):
-        assert "not found" in failure_resolve(uri, urdf)
+        assert "not found" in failure_of(uri, urdf)
     beside = touch(home / "Downloads" / "hand" / "part.stl")
     assert resolve_uri("package://hand/part.stl", urdf, NOWHERE) == beside
     touch(home / "secret" / "package.xml", "<package><name>other</name></package>")
@@ -502,7 +502,7 @@ def test_paths_start_at_the_folder_of_the_description_and_stay_near(urdf, tmp_pa
         assert resolve_uri(uri, urdf, NOWHERE) == own_file
     assert resolve_uri("../meshes/b.stl", urdf, NOWHERE) == beside
     assert resolve_uri(packaged.as_uri(), urdf, NOWHERE) == packaged
-    assert "leaves" in failure_resolve(private.as_uri(), urdf)
+    assert "leaves" in failure_of(private.as_uri(), urdf)
     assert resolve_uri(str(private), urdf, PackageFinder((private.parent,))) == private
 
 
@@ -549,7 +549,7 @@ def test_a_symbolic_link_cannot_leave_the_tree(tmp_path, urdf):
     (urdf.parent / "in.stl").symlink_to(inside)
     (urdf.parent / "folder").symlink_to(private.parent)
     for uri in ("out.stl", "folder/a.stl", "package://arm_description/urdf/out.stl"):
-        assert "is a symbolic link that leaves" in failure_resolve(uri, urdf)
+        assert "is a symbolic link that leaves" in failure_of(uri, urdf)
     assert resolve_uri("in.stl", urdf, NOWHERE) == urdf.parent / "in.stl"
     assert resolve_uri("out.stl", urdf, default_finder(root=private.parent)).name == "out.stl"
 
@@ -577,11 +577,11 @@ def test_a_root_extends_the_permitted_tree(tmp_path):
     mesh = touch(tmp_path / "data" / "meshes" / "a.stl")
     packaged = touch(tmp_path / "data" / "hand" / "b.stl")
     touch(tmp_path / "c.stl")
-    assert "or name the folder" in failure_resolve("../../meshes/a.stl", urdf)
+    assert "or name the folder" in failure_of("../../meshes/a.stl", urdf)
     finder = default_finder(root=tmp_path / "data")
     assert resolve_uri("../../meshes/a.stl", urdf, finder) == mesh
     assert resolve_uri("package://hand/b.stl", urdf, finder) == packaged
-    assert "leaves" in failure_resolve("../../../c.stl", urdf, finder)
+    assert "leaves" in failure_of("../../../c.stl", urdf, finder)
     assert resolve_uri("meshes/a.stl", urdf, finder) == mesh, "a name from the root, too"
     near = touch(urdf.parent / "meshes" / "a.stl")
     assert resolve_uri("meshes/a.stl", urdf, finder) == near, "the own folder comes first"

@@ -1,23 +1,45 @@
-"""Loading parts: the source file with the corrections of the manifest; scaled links."""
+"""Manifests and parts, and imported robots as parts."""
 
 import importlib.metadata
+import json
 import math
+import runpy
+from pathlib import Path
 
+import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jsonschema import Draft202012Validator
 
-from helpers.parts import PINCER, write_part
-from morphgen.checks import rules
+from helpers.faulty_robots import with_joint
+from helpers.grammars import LIBRARY
+from helpers.parts import MANIFEST, PINCER, write_part
+from helpers.robots import arm
+from morphgen.checks import check, rules
 from morphgen.checks.rules import check_links_apart
-from morphgen.errors import PartError
+from morphgen.checks.self_collision import SelfCollisionChecker
+from morphgen.errors import FormatError, PartError
 from morphgen.formats import description
 from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.xacro.expand import Expansion
 from morphgen.grammar.library import default_library
-from morphgen.grammar.manifest import read_manifest
+from morphgen.grammar.manifest import (
+    MOUNT_YAW_PARAMETER,
+    SCHEMA_FILE,
+    FrameSpec,
+    PackageSource,
+    Parameter,
+    parse_value,
+    read_manifest,
+    resolve_values,
+)
 from morphgen.grammar.part import load_part
-from morphgen.model.geometry import Box, scale_shape
+from morphgen.grammar.robot_source import import_robot, resolve_robot
+from morphgen.model.geometry import IDENTITY, Box, scale_shape
+from morphgen.model.kinematics import frame_pose
+from morphgen.model.tree import rename
 
 BAR = 0.02 * 0.02 * 1000  # kg a metre
 GONE = {"file": None, "density": None, "parameters": None}
@@ -268,3 +290,270 @@ def test_lengths_masses_and_inertias_scale_at_constant_density():
         assert b.mass == pytest.approx(f**3 * a.mass)
         assert b.inertia == pytest.approx([f**5 * value for value in a.inertia])
         assert {shape.geometry.scale for shape in other.links[i].visuals} == {(f, f, f)}
+
+
+REAL = {
+    "file": None,
+    "density": None,
+    "parameters": None,
+    "source": {"package": "rtb-data", "file": "a/b.urdf", "args": {"hand": True, "n": 3}},
+    "citation": "A. Body",
+}
+
+
+def refusal(path):
+    with pytest.raises(PartError) as caught:
+        read_manifest(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith(str(path))
+    return message.removeprefix(str(path))
+
+
+def test_a_template_manifest_has_a_xacro_file_and_parameters(tmp_path):
+    path = write_part(tmp_path)
+    manifest = read_manifest(path)
+    assert manifest.is_template
+    assert manifest.source == tmp_path / "pincer.xacro"
+    assert manifest.tool == FrameSpec("palm", (0.0, 0.0, "${length + 0.05}"))
+    length = manifest.parameters["length"]
+    assert (length.minimum, length.default, length.maximum, length.unit) == (0.1, 0.2, 0.5, "m")
+    assert manifest.home == {"left_slide": 0.01, "wheel": 0.5}
+
+
+def test_a_real_part_manifest_has_a_package_and_xacro_arguments(tmp_path):
+    manifest = read_manifest(write_part(tmp_path, **REAL))
+    assert not manifest.is_template
+    source = manifest.source
+    assert isinstance(source, PackageSource)
+    assert (source.package, source.file) == ("rtb-data", "a/b.urdf")
+    assert source.args == {"hand": "true", "n": "3"}
+    assert manifest.citation == "A. Body"
+
+
+def test_optional_keys_default_to_empty(tmp_path):
+    manifest = read_manifest(write_part(tmp_path, mount=None, tool=None, home=None))
+    assert (manifest.mount, manifest.tool, manifest.without) == (None, None, ())
+    assert not {**manifest.home, **manifest.ports}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        *(
+            ({key: None}, f":1: missing key {key!r}")
+            for key in ("kind", "licence", "name", "root", "summary")
+        ),
+        ({"paramters": {}}, ": unknown key 'paramters'; did you mean 'parameters'? valid: "),
+        ({"mass": {}}, "unknown key 'mass'"),
+        ({"citation": "x"}, "unknown key 'citation'"),
+        (REAL | {"density": MANIFEST["density"]}, "unknown key 'density'"),
+        ({"kind": "arn"}, "2: kind: unknown value 'arn'; did you mean 'arm'? valid: arm, base"),
+        ({"file": None}, "needs 'source' (a data package) or 'file' (a template)"),
+        ({"mount": "palm"}, "6: mount: invalid value 'palm'; expected keys and values"),
+        ({"tool": {"link": "palm", "xyz": [0, 1]}}, "tool.xyz: invalid value [0, 1]; expected a"),
+        ({"tool": {"link": "palm", "xyz": [0, 0, float("inf")]}}, "tool.xyz[2]: invalid value"),
+        ({"ports": {"flange": {"link": "palm", "at": 1}}}, "ports.flange: unknown key 'at'"),
+        ({"ports": {5: {"link": "palm"}}}, "ports: key 5 is not text; quote it"),
+        ({"density": 0}, "density: invalid value 0; expected a number > 0"),
+        (
+            {"parameters": {"length": {"default": 0, "min": 0, "mx": 1}}},
+            "parameters.length: unknown key 'mx'; did you mean 'max'?",
+        ),
+        (REAL | {"source": {"package": "rtb-data"}}, "source: missing key 'file'"),
+        (REAL | {"scaling": {"palm": 2}}, "scaling.palm: invalid value 2; expected text or keys"),
+    ],
+)
+def test_a_wrong_key_or_value_is_an_error_that_names_file_and_key(tmp_path, changes, message):
+    assert message in refusal(write_part(tmp_path, **changes))
+
+
+def test_the_name_must_equal_the_file_name(tmp_path):
+    path = write_part(tmp_path).rename(tmp_path / "tongs.yaml")
+    assert refusal(path) == ": name 'pincer' differs from the file's, 'tongs'"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name: pincer\nkind: [ee\nroot: palm\n", ":3:5: invalid YAML: "),
+        ("name: pincer\nkind: ee\nname: pincer\n", ":3:1: invalid YAML: key 'name' is given twice"),
+        ("name: !!python/object/apply:os.getcwd []\n", ":1:7: invalid YAML: "),
+        ("name: 2020-13-45\n", ": invalid YAML: "),
+        ("- name\n- kind\n", ":1: invalid value ['name', 'kind']; expected keys and values"),
+        ("", ":1: missing key 'name'"),
+        (b"summary: pr\xe9nom", ": invalid YAML"),
+        (None, ": no such file"),
+        ("5: 5\n", ":1: key 5 is not text; quote it"),
+    ],
+)
+def test_invalid_yaml_is_an_error_with_line_and_column(tmp_path, text, message):
+    path = tmp_path / "pincer.yaml"
+    if text is not None:
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    assert refusal(path).startswith(message)
+
+
+SIZE_IN_MANIFEST = Parameter(0.1, 0.05, 0.5, "m")
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("0.1", 0.1), ("80mm", 0.08), ("12 cm", 0.12), ("1e-1m", 0.1)]
+)
+def test_values_are_converted_to_si_units(text, value):
+    assert parse_value(text, SIZE_IN_MANIFEST, "ee.size") == pytest.approx(value)
+    assert parse_value("45deg", MOUNT_YAW_PARAMETER, "ee.mount_yaw") == pytest.approx(math.pi / 4)
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (["45deg", "1kg", "3 furlongs"], r"ee\.size=.*wrong unit.*units: m/cm/mm"),
+        (["big", "", "1.2.3", "nan", "inf", "0x10"], "not a number"),
+        (["0.6", "10mm", "-0.1"], r"out of range; expected 0\.05 to 0\.5 m"),
+    ],
+)
+def test_invalid_values_are_errors(texts, message):
+    for text in texts:
+        with pytest.raises(PartError, match=message):
+            parse_value(text, SIZE_IN_MANIFEST, "ee.size")
+
+
+def test_an_unknown_parameter_suggests_the_nearest():
+    with pytest.raises(PartError, match="no parameter 'sise'; did you mean 'size'"):
+        resolve_values({"sise": 0.1}, {"size": SIZE_IN_MANIFEST}, "plane")
+
+
+def test_a_default_outside_its_range_is_a_manifest_error():
+    with pytest.raises(ValueError, match="default 2 is outside"):
+        Parameter(2.0, 0.0, 1.0, "m")
+
+
+VALIDATOR = Draft202012Validator(json.loads(SCHEMA_FILE.read_text(encoding="utf-8")))
+MINIMAL = "name: tip\nkind: ee\nsummary: a tip\nroot: tip\nlicence: MIT\n"
+SCRIPT = Path(__file__).parents[2] / "docs" / "part_manifest.py"
+
+
+def test_the_stored_schema_is_that_of_the_records():
+    schema = runpy.run_path(str(SCRIPT))["manifest_schema"]()
+    assert VALIDATOR.schema == json.loads(json.dumps(schema)), f"run {SCRIPT}"
+    for record in schema["$defs"].values():
+        assert all(entry["description"] for entry in record["properties"].values())
+
+
+@pytest.mark.parametrize("path", LIBRARY.paths.values(), ids=lambda path: path.stem)
+def test_shipped_manifests_are_valid(path):
+    data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    assert [error.message for error in VALIDATOR.iter_errors(data)] == []
+
+
+def test_the_smallest_manifest_is_valid(tmp_path):
+    assert VALIDATOR.is_valid(yaml.safe_load(MINIMAL + "file: tip.xacro\n"))
+    (tmp_path / "tip.yaml").write_text(MINIMAL + "file: tip.xacro\n")
+    assert read_manifest(tmp_path / "tip.yaml").name == "tip"
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        "",
+        "file: tip.xacro\nmas: {}",
+        "file: tip.xacro\nmass: {tip: 1}",
+        "source: {package: p, file: f}\ndensity: 1000",
+        "source: {package: p, file: f}\nfile: tip.xacro",
+        "file: tip.xacro\nports: {end: {link: tip, xyz: [0, 0]}}",
+        "file: tip.xacro\nparameters: {size: {default: 1, min: 0}}",
+        "file: tip.xacro\nparameters: {size: {default: 1, min: 0, max: 2, unit: ft}}",
+    ],
+)
+def test_what_the_reader_refuses_is_invalid(lines, tmp_path):
+    assert not VALIDATOR.is_valid(yaml.safe_load(MINIMAL + lines))
+    (tmp_path / "tip.yaml").write_text(MINIMAL + lines)
+    with pytest.raises(PartError):
+        read_manifest(tmp_path / "tip.yaml")
+
+
+def test_the_tool_frame_is_at_the_given_link_if_there_is_one(robot_urdf):
+    robot = import_robot(robot_urdf(arm()), tool="left")
+    frame = robot.frame("tool")
+    assert (frame.link, frame.T_link_frame) == ("left", IDENTITY)
+    assert robot.provenance["source"] == "some_robot.urdf"
+    robot = import_robot(robot_urdf(arm()))
+    assert robot.frames == ()
+    assert "tool-missing" in {finding.code for finding in check(robot)}
+
+
+def test_the_given_root_link_becomes_the_root(robot_urdf):
+    robot = import_robot(robot_urdf(arm()), root_link="lower", tool="slider")
+    assert [link.name for link in robot.links] == ["lower", "slider", "left", "right"]
+    assert frame_pose(robot, (0.02, 0.0))[:3, 3] == pytest.approx([0, 0, 0.32])
+
+
+def test_the_robot_has_the_name_of_the_file_unless_a_name_is_given(robot_urdf):
+    assert import_robot(robot_urdf(arm())).name == "arm"
+    assert import_robot(robot_urdf(arm()), name="limb").name == "limb"
+
+
+def test_home_has_no_self_collision(robot_urdf):
+    robot = import_robot(robot_urdf(arm()))
+    assert list(SelfCollisionChecker(robot).penetrations([robot.home])) == [{}]
+    assert ("left", "slider") in robot.ignore_pairs
+
+
+def test_home_is_zero_or_the_middle_of_a_range_without_zero(robot_urdf):
+    path = robot_urdf(with_joint(arm(), "elbow", limits=(0.5, 1.5)))
+    assert import_robot(path).home == pytest.approx(arm().home)  # morphgen's own, which says it
+    path.write_text(path.read_text().replace("morphgen>", "others>"))
+    assert import_robot(path).home == pytest.approx((0.0, 1.0, 0.0, 0.0))
+
+
+def test_safe_repairs_are_applied_and_reported(robot_urdf):
+    path = robot_urdf(arm())
+    path.write_text(path.read_text().replace('<axis xyz="1 0 0"', '<axis xyz="2 0 0"'))
+    robot = import_robot(path)
+    assert robot.joints[1].axis == pytest.approx((1, 0, 0))
+    assert any("joint elbow" in repair for repair in robot.provenance["repairs"])
+    as_is = import_robot(path, repair=False)
+    assert as_is.joints[1].axis == (2.0, 0.0, 0.0)
+    assert as_is.provenance["repairs"] == []
+    valid = with_joint(arm(), "right", mimic=None)
+    assert import_robot(robot_urdf(valid)).provenance["repairs"] == []
+
+
+def test_a_link_named_tool_is_renamed_in_favour_of_the_frame(robot_urdf):
+    path = robot_urdf(rename(arm(), {"slider": "tool"}, {"extend": "tool_joint"}))
+    robot = import_robot(path, tool="tool")
+    assert robot.frame("tool").link == "tool_link"
+    assert import_robot(path).frames == robot.frames
+    assert resolve_robot(path, default_library()).frame("tool").link == "tool_link"
+    assert {"tool", "tool_joint"}.isdisjoint({*robot.link_index, *robot.joint_index})
+    assert "frame-name-taken" not in {finding.code for finding in check(robot)}
+    np.testing.assert_allclose(
+        frame_pose(robot, robot.home),
+        frame_pose(import_robot(robot_urdf(arm()), tool="slider"), robot.home),
+        atol=1e-12,
+    )
+
+
+def test_xacro_arguments_are_passed(tmp_path):
+    path = tmp_path / "pincer.urdf.xacro"
+    path.write_text(PINCER)
+    robot = import_robot(path, {"length": "0.3"}, root_link="palm")
+    assert robot.root.collisions[0].geometry == Box((0.02, 0.02, 0.3))
+    assert robot.joints[1].mimic.joint == "left_slide"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"root_link": "bass"}, "no link 'bass' for root link; did you mean 'base'? valid: base,"),
+        ({"tool": "slidr"}, "no link 'slidr' for tool; did you mean 'slider'?"),
+        ({"root_link": "slider", "tool": "base"}, "tool 'base' is not below the root link"),
+        ({"args": {"length": "1"}}, "xacro arguments length for a file that is not a xacro"),
+    ],
+)
+def test_unknown_links_are_errors(robot_urdf, options, message):
+    path = robot_urdf(arm())
+    with pytest.raises(FormatError) as caught:
+        import_robot(path, **options)
+    assert str(caught.value).startswith(f"{path}: {message}")

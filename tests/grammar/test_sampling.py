@@ -1,17 +1,25 @@
-"""Sampling and mutation are reproducible and yield only robots that pass checks and conditions."""
+"""Sampling from grammars: draws and sets of robots."""
 
 import itertools
 import json
+import math
+import shutil
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pandas
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
+from helpers.commands import start, tree
 from helpers.grammars import CATEGORIES, LIBRARY, benchmark_counts, grammar, shipped, unphysical
 from morphgen.checks import check
 from morphgen.checks.conformance import conformance
-from morphgen.errors import GrammarError, MorphgenError
+from morphgen.errors import FormatError, GrammarError, MorphgenError
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.rounding import round_number
 from morphgen.grammar import sampling
@@ -19,8 +27,20 @@ from morphgen.grammar.analysis import check_grammar, count_structures
 from morphgen.grammar.derivation import difference
 from morphgen.grammar.derive import RandomChooser, derive
 from morphgen.grammar.grammar_file import grammar_from_text, grammar_text
+from morphgen.grammar.robot_set import (
+    GRAMMAR,
+    INDEX,
+    JOURNAL,
+    SETTINGS,
+    SetConfig,
+    make_in_processes,
+    make_on_ray,
+    make_set,
+    read_index,
+)
 from morphgen.grammar.sampling import Sample, SamplingError, mutate, sample_robot, sample_robots
 from morphgen.grammar.syntax import parse_condition
+from morphgen.progress import show_progress
 
 
 def bodies(name, n, **options):
@@ -252,3 +272,339 @@ def test_robots_have_the_counts_of_the_benchmark_and_loaders_agree(category, n, 
         report = conformance(folder, 20)
         assert report.passed, report
         assert [f.code for f in check(read_bundle(folder)) if f.severity != "info"] == []
+
+
+def plan(folder, category="cubes", **changes):
+    text = grammar_text(shipped(category))
+    config = SetConfig(folder, category, text, 0, (), light=True, picture=False, library=())
+    return replace(config, **changes)
+
+
+@pytest.fixture
+def whole(tmp_path):
+    """A set of eight cubes."""
+    config = plan(tmp_path / "whole")
+    make_set(config, 8, make_in_processes())
+    return config.folder
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_a_set_that_fails_before_its_first_robot_leaves_nothing(exists, tmp_path):
+    folder = tmp_path / "new" / "set"
+    if exists:
+        folder.mkdir(parents=True)
+    with pytest.raises(SamplingError, match=r"failed at: where .reach > 50"):
+        make_set(plan(folder, where=("reach > 50",)), 2, make_in_processes())
+    assert [path.name for path in tmp_path.rglob("*")] == ["new", "set"] * exists
+    assert make_set(plan(folder), 1, make_in_processes()).made == 1
+
+
+def test_a_set_that_fails_later_keeps_its_robots(tmp_path):
+    def work(config, indices):
+        yield from make_in_processes()(config, indices[:1])
+        raise SamplingError("no more")
+
+    with pytest.raises(SamplingError, match="no more"):
+        make_set(plan(tmp_path / "set"), 2, work)
+    report = make_set(plan(tmp_path / "set"), 2, make_in_processes())
+    assert (report.made, report.kept) == (1, 1)
+
+
+def interrupted(plan, n, done):
+    """Make a set that stops like a killed process after some robots."""
+
+    class Killed(BaseException):
+        pass
+
+    def work(plan, indices):
+        yield from make_in_processes()(plan, indices[:done])
+        raise Killed
+
+    with pytest.raises(Killed):
+        make_set(plan, n, work)
+
+
+def test_a_light_set_has_one_folder_per_robot_an_index_and_the_grammar(whole):
+    names = [f"cubes-{i:06d}" for i in range(8)]
+    assert sorted(path.name for path in whole.iterdir()) == sorted(
+        [*names, GRAMMAR, INDEX, SETTINGS]
+    )
+    assert sorted(p.name for p in (whole / names[0]).iterdir()) == ["derivation.txt", "robot.urdf"]
+    assert [record["name"] for record in read_index(whole)] == names
+    assert (whole / GRAMMAR).read_text() == grammar_text(shipped("cubes"))
+
+
+def test_the_index_has_one_json_line_per_robot(whole):
+    for line in (whole / INDEX).read_text().splitlines():
+        record = json.loads(line)
+        written = (whole / record["name"] / "derivation.txt").read_text().strip()
+        assert record["derivation"] == written
+        assert (record["dof"], record["links"], record["movable"]) == (2, 3, 2)
+        assert record["mass"] > 0
+        assert record["choices"].keys() == {"robot/0.cubes.size"}
+    table = pandas.read_json(whole / INDEX, lines=True)
+    assert list(table["index"]) == list(range(8))
+    assert table["mass"].dtype == float
+
+
+def test_a_full_set_consists_of_bundles(tmp_path):
+    make_set(plan(tmp_path / "s", light=False), 1, make_in_processes())
+    files = {path.name for path in (tmp_path / "s" / "cubes-000000").iterdir()}
+    assert {"card.json", "robot.urdf", "robot.xml"} <= files
+
+
+def test_progress_reaches_the_number_of_robots(tmp_path):
+    seen = []
+    for n, work in ((3, make_in_processes()), (5, make_in_processes(2))):
+        with show_progress(lambda *now: seen.append(now)):
+            make_set(plan(tmp_path / "s"), n, work)
+    assert seen == [(0, 3), (1, 3), (2, 3), (3, 3), (3, 5), (4, 5), (5, 5)]
+
+
+@pytest.mark.parametrize("light", [pytest.param(True, marks=pytest.mark.slow), False])
+def test_two_processes_write_the_same_bytes_as_one(tmp_path, light):
+    one = plan(tmp_path / "one", "chain", light=light)
+    two = replace(one, folder=tmp_path / "two")
+    n = 20 if light else 3
+    make_set(one, n, make_in_processes())
+    make_set(two, n, make_in_processes(2))
+    assert tree(one.folder) == tree(two.folder)
+
+
+def test_a_larger_set_contains_the_smaller_one(tmp_path, whole):
+    config = plan(tmp_path / "s")
+    assert make_set(config, 3, make_in_processes()).made == 3
+    report = make_set(config, 8, make_in_processes())
+    assert (report.made, report.kept) == (5, 3)
+    assert tree(config.folder) == tree(whole)
+    assert make_set(config, 2, make_in_processes()).made == 0
+    assert tree(config.folder) == tree(whole)
+
+
+@pytest.mark.parametrize("done", [0, 1, 7, 8])
+def test_robots_written_before_an_interruption_are_kept(tmp_path, whole, done):
+    config = plan(tmp_path / "s")
+    interrupted(config, 8, done)
+    with pytest.raises(FormatError, match=r"is not a finished set: it has no index\.jsonl"):
+        read_index(config.folder)
+    report = make_set(config, 8, make_in_processes())
+    assert (report.made, report.kept, report.duplicates) == (8 - done, done, [])
+    assert tree(config.folder) == tree(whole)
+
+
+def test_deleted_robots_are_regenerated(tmp_path, whole):
+    before = tree(whole)
+    shutil.rmtree(whole / "cubes-000003")
+    (whole / "cubes-000005" / "robot.urdf").unlink()
+    report = make_set(plan(whole), 8, make_in_processes())
+    assert (report.made, report.kept) == (2, 6)
+    assert tree(whole) == before
+    (whole / INDEX).unlink()  # and there is no journal
+    assert make_set(plan(whole), 8, make_in_processes()).made == 8
+    assert tree(whole) == before
+
+
+@pytest.mark.parametrize("cut", [1, 40, -1])
+def test_a_truncated_journal_regenerates_one_robot(tmp_path, whole, cut):
+    config = plan(tmp_path / "s")
+    interrupted(config, 8, 5)
+    lines = (config.folder / JOURNAL).read_text().splitlines()
+    (config.folder / JOURNAL).write_text(
+        "".join(f"{line}\n" for line in lines[:4]) + lines[4][:cut]
+    )
+    interrupted(config, 8, 2)
+    report = make_set(config, 8, make_in_processes())
+    assert report.made in (2, 3)
+    assert tree(config.folder) == tree(whole)
+
+
+def test_partially_written_robots_are_removed(tmp_path, whole):
+    config = plan(tmp_path / "s")
+    interrupted(config, 8, 2)
+    (config.folder / ".cubes-000002.x1y2").mkdir()
+    (config.folder / ".cubes-000002.x1y2" / "robot.urdf").write_text("<robot")
+    make_set(config, 8, make_in_processes())
+    assert tree(config.folder) == tree(whole)
+
+
+@pytest.mark.parametrize("left", [[], [f".{GRAMMAR}.x1y2"], [GRAMMAR, f".{SETTINGS}.x1y2"]])
+def test_a_folder_interrupted_before_the_first_robot_can_be_continued(tmp_path, whole, left):
+    config = plan(tmp_path / "s")
+    config.folder.mkdir()
+    for name in left:
+        if name == GRAMMAR:
+            (config.folder / name).write_text(config.grammar_text)
+        else:
+            (config.folder / name).mkdir()
+    make_set(config, 8, make_in_processes())
+    assert tree(config.folder) == tree(whole)
+
+
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_killed_run_resumes_to_the_same_bytes(tmp_path, jobs):
+    words = ("sample", "chain", "-n", 32, "--seed", 3, "--light", "--jobs", jobs)
+    process = start(*words, "--out", tmp_path / "killed")
+    journal = tmp_path / "killed" / JOURNAL
+    for _ in range(1200):
+        if journal.exists() and len(journal.read_bytes().splitlines()) > 3:
+            break
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.communicate(timeout=30)  # ends when no worker holds the pipe any more
+    assert not (tmp_path / "killed" / INDEX).exists()
+    again = start(*words, "--out", tmp_path / "killed")
+    out, err = again.communicate(timeout=60)
+    assert (again.returncode, "32 made" in out) == (0, False), err
+    make_set(plan(tmp_path / "whole", "chain", seed=3), 32, make_in_processes())
+    assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": 1}, "holds another set: its seed is 0, not 1; name another folder"),
+        ({"light": False}, "its light is True, not False"),
+        ({"where": ("mass < 1",)}, "its where is [], not ['mass < 1']"),
+        ({"grammar_name": "dice"}, "its grammar is 'cubes', not 'dice'"),
+        (
+            {"grammar_text": "robot -> cubes\n"},
+            "holds a set of another grammar 'cubes': line 1 of its grammar.grammar is "
+            "'robot -> cubes(size=uniform(0.02, 0.2))', not 'robot -> cubes'; name another folder, "
+            "or delete this one",
+        ),
+        ({"grammar_text": "robot -> cubes(size=uniform(0.02, 0.2))"}, "line 2 of its grammar.gra"),
+    ],
+)
+def test_a_set_is_continued_only_with_the_same_settings(whole, change, message):
+    before = tree(whole)
+    with pytest.raises(FormatError) as caught:
+        make_set(plan(whole, **change), 9, make_in_processes())
+    assert message in str(caught.value)
+    assert tree(whole) == before
+
+
+@pytest.mark.parametrize("name", ["notes.txt", GRAMMAR, ""])
+def test_a_folder_with_other_files_or_a_file_is_an_error(tmp_path, name):
+    if name:
+        (tmp_path / "s").mkdir()
+    (tmp_path / "s" / name).write_text("mine")
+    with pytest.raises(
+        FormatError, match=r"exists and is not a set \(no set\.json\); name another"
+    ):
+        make_set(plan(tmp_path / "s"), 1, make_in_processes())
+    assert (tmp_path / "s" / name).read_bytes() == b"mine"
+
+
+def test_duplicate_robots_are_reported(tmp_path):
+    config = plan(tmp_path / "s", grammar_name="g", grammar_text="robot -> cubes\n")
+    report = make_set(config, 3, make_in_processes())
+    assert report.duplicates == [("g-000001", "g-000000"), ("g-000002", "g-000000")]
+    hashes = {record["hash"] for record in read_index(config.folder)}
+    assert len(hashes) == 1
+
+
+def test_rejected_draws_are_counted_over_the_whole_set(tmp_path):
+    config = plan(tmp_path / "s", where=("mass < 0.5 and dof == 2",))
+    report = make_set(config, 8, make_in_processes())
+    counted = sum(sum(record["rejected"].values()) for record in read_index(config.folder))
+    assert report.rejected == {"where (mass < 0.5)": counted}
+    assert counted > 0
+    assert make_set(config, 8, make_in_processes()).rejected == report.rejected
+
+
+@pytest.mark.parametrize(
+    "work", [make_in_processes(), make_in_processes(2)], ids=["1 job", "2 jobs"]
+)
+def test_an_unsatisfiable_condition_stops_the_run(tmp_path, work):
+    with pytest.raises(SamplingError, match=r"500 failed at: where \(mass > 900\)"):
+        make_set(plan(tmp_path / "s", where=("mass > 900",)), 4, work)
+
+
+def test_a_light_robot_references_meshes_in_their_packages(tmp_path):
+    config = plan(tmp_path / "s", grammar_name="g", grammar_text="robot -> fixed ur5\n")
+    make_set(config, 1, make_in_processes())
+    text = (config.folder / "g-000000" / "robot.urdf").read_text()
+    assert 'filename="package://' in text
+    assert str(Path.home()) not in text
+
+
+def test_a_concurrent_run_in_the_same_folder_is_an_error(tmp_path):
+    config = plan(tmp_path / "set")
+
+    def work(plan, indices):
+        with pytest.raises(FormatError, match="is being written by another run"):
+            make_set(plan, 8, make_in_processes())
+        yield from make_in_processes()(plan, indices)
+
+    make_set(config, 2, work)
+    assert len(read_index(config.folder)) == 2
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"name": "../../etc"},
+        {"name": ".."},
+        {"name": 5},
+        {"index": "0"},
+        {"choices": {"a": math.nan}},
+        {"rejected": [1]},
+    ],
+)
+def test_an_invalid_index_line_is_an_error(whole, change):
+    lines = (whole / INDEX).read_text().splitlines()
+    lines[1] = json.dumps(json.loads(lines[1]) | change)
+    (whole / INDEX).write_text("\n".join(lines))
+    with pytest.raises(
+        FormatError, match=r"index.jsonl:2: not a line of an index of morphgen samp"
+    ):
+        read_index(whole)
+
+
+@pytest.mark.parametrize("line", ["[" * 100_000, "[]", "null", "5", "{}"])
+def test_an_invalid_journal_is_ignored(whole, line):
+    (whole / JOURNAL).write_text(line + "\n")
+    assert make_set(plan(whole), 9, make_in_processes()).made == 1
+    assert len(read_index(whole)) == 9
+    (whole / INDEX).write_text(line + "\n")
+    with pytest.raises(FormatError, match=r"index.jsonl:1: not a line of an index"):
+        read_index(whole)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "[]", "{", '{"grammar": 5}', "\0"])
+def test_invalid_settings_are_errors(whole, text):
+    (whole / SETTINGS).write_text(text)
+    with pytest.raises(
+        FormatError, match=r"set.json: (invalid JSON|is nested deeper|expected the settings)"
+    ):
+        make_set(plan(whole), 9, make_in_processes())
+
+
+@pytest.fixture(scope="module")
+def address():
+    """Address of a cluster of two nodes with one process each."""
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    cluster.add_node(num_cpus=1)
+    cluster.wait_for_nodes()
+    yield cluster.address
+    cluster.shutdown()
+
+
+@pytest.mark.slow
+def test_a_ray_cluster_writes_the_same_bytes_as_one_process(address, tmp_path):
+    make_set(plan(tmp_path / "serial"), 40, make_in_processes())
+    report = make_set(plan(tmp_path / "ray"), 40, make_on_ray(address))
+    assert report.made == 40
+    assert tree(tmp_path / "ray") == tree(tmp_path / "serial")
+    with pytest.raises(SamplingError, match="0 of 500 draws") as refused:
+        make_set(plan(tmp_path / "set", where=("mass > 1000",)), 4, make_on_ray(address))
+    assert "Traceback" not in str(refused.value)
+
+
+@pytest.mark.slow
+def test_an_address_without_a_cluster_is_an_error(tmp_path):
+    with pytest.raises(MorphgenError, match=r"no Ray cluster at '127\.0\.0\.1:1': .*refused"):
+        make_set(plan(tmp_path / "set"), 4, make_on_ray("127.0.0.1:1"))

@@ -1,10 +1,40 @@
-"""Parsing grammar text to a syntax tree; syntax errors have line, column and what was expected."""
+"""Grammar files: syntax, values, includes, and what the analysis finds."""
 
+import itertools
+import json
+import math
+import re
+import statistics
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped, unphysical
+from helpers.robots import arm
 from morphgen.errors import GrammarError
+from morphgen.grammar.analysis import (
+    check_grammar,
+    count_structures,
+    enumerate_structures,
+    variables,
+)
+from morphgen.grammar.compose import join
+from morphgen.grammar.derive import FirstChooser, RandomChooser, derive
+from morphgen.grammar.grammar_file import (
+    find_grammar,
+    grammar_from_text,
+    grammar_names,
+    grammar_text,
+    load_grammar,
+)
+from morphgen.grammar.manifest import UNITS
+from morphgen.grammar.request import parse_request, pin
+from morphgen.grammar.robot_set import SetConfig, make_in_processes, make_set
+from morphgen.grammar.sampling import SamplingError, sample_robots
 from morphgen.grammar.syntax import (
     Expression,
     Include,
@@ -14,6 +44,18 @@ from morphgen.grammar.syntax import (
     Where,
     parse_condition,
     parse_grammar,
+)
+from morphgen.grammar.values import (
+    DISTRIBUTIONS,
+    PROPERTIES,
+    Distribution,
+    RobotProperties,
+    Scope,
+    clauses,
+    evaluate,
+    holds,
+    require_condition,
+    typical_value,
 )
 
 
@@ -183,3 +225,522 @@ def combined(below):
 @given(st.recursive(NUMBERS | NAMES, combined, max_leaves=8))
 def test_random_expressions_round_trip_through_printing(expression):
     assert str(argument(str(expression))) == str(expression)
+
+
+LOG_MEAN = 99 / math.log(100)
+NAMED_VALUES = {"r": (0.02, "m"), "k": (3.0, ""), "turn": (1.0, "rad")}
+
+
+def value(text):
+    return evaluate(parse_condition(text, "g"), Scope(NAMED_VALUES, typical_value, ""))
+
+
+def drawn(text, n=4000):
+    """Return reproducible values of a distribution."""
+    rng = np.random.default_rng(0)
+    expression = parse_condition(text, "g")
+    scope = Scope({}, lambda _, d: d.draw(rng.random, rng.standard_normal), "")
+    return [evaluate(expression, scope)[0] for _ in range(n)]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("30mm", (0.03, "m")),
+        ("3cm + 5mm", (0.035, "m")),
+        ("200g", (0.2, "kg")),
+        ("2*r - 1cm", (0.03, "m")),
+        ("r / 1mm", (20.0, "")),
+        ("1 / k", (1 / 3, "")),
+        ("-(r + r)", (-0.04, "m")),
+        ("k * turn", (3.0, "rad")),
+        ("1 + 2 * k", (7.0, "")),
+    ],
+)
+def test_arithmetic_keeps_units(text, expected):
+    number, unit = value(text)
+    assert (number, unit) == (pytest.approx(expected[0]), expected[1])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1m + 1kg", "1:4: (1m + 1kg) mixes units m and kg"),
+        ("1m * 2m", "1:4: (1m * 2m) multiplies m by m"),
+        ("1 / 2m", "1:3: (1 / 2m) divides a pure number by m"),
+        ("r - turn", "1:3: (r - turn) mixes units m and rad"),
+        ("uniform(1m, 2kg)", "1:1: uniform(1m, 2kg) mixes units kg and m"),
+        ("3inch", "1:1: unknown unit 'inch'; valid: N, cm, deg, g, kg, m, mm, rad"),
+        ("q + 1", "1:1: unknown value 'q'; valid: k, r, turn"),
+        ("1 / 0", "1:3: (1 / 0) divides by zero"),
+        ("1e300 * 1e300", "1:7: (1e+300 * 1e+300) is not finite"),
+        ("(1 < 2) + 1", "1:4: (1 < 2) is a condition, not a value"),
+        ("uniforn(1, 2)", "1:1: unknown distribution 'uniforn'; did you mean 'uniform'?"),
+        ("uniform(1)", "1:1: uniform(1) does not fit uniform(low, high)"),
+        ("uniform(2, 1)", "1:1: uniform(2, 1): low is above high in uniform(low, high)"),
+        ("loguniform(0, 1)", "1:1: loguniform(0, 1): low must be above zero"),
+        ("normal(1, 2)", "does not fit normal(mean, deviation, low, high)"),
+        ("normal(1, -1, 0, 2)", "the deviation is negative"),
+        ("choice()", "1:1: choice() does not fit choice(value, ...)"),
+        ("randint(1, 2.5)", "randint needs whole numbers"),
+    ],
+)
+def test_invalid_arithmetic_is_an_error_with_a_position(text, message):
+    with pytest.raises(GrammarError, match=r"^g:[^\n]*$") as caught:
+        value(text)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "low", "high", "mean", "deviation"),
+    [
+        ("uniform(1, 3)", 1, 3, 2, 2 / math.sqrt(12)),
+        ("loguniform(1, 100)", 1, 100, LOG_MEAN, math.sqrt(9999 / math.log(1e4) - LOG_MEAN**2)),
+        ("normal(5, 2, -1, 11)", -1, 11, 5, 2),
+        ("randint(1, 6)", 1, 6, 3.5, math.sqrt(35 / 12)),
+        ("choice(7, 1, 4, 1)", 1, 7, 3.25, math.sqrt(6.1875)),
+        ("uniform(2, 2)", 2, 2, 2, 0),
+    ],
+)
+def test_values_have_the_bounds_mean_and_deviation_of_their_distribution(
+    text, low, high, mean, deviation
+):
+    values = drawn(text)
+    assert low <= min(values) <= low + 0.02 * (high - low)
+    assert high >= max(values) >= high - 0.02 * (high - low)
+    assert statistics.fmean(values) == pytest.approx(mean, abs=4 * deviation / math.sqrt(4000))
+    assert statistics.pstdev(values) == pytest.approx(deviation, rel=0.05)
+
+
+def test_a_normal_is_clipped_not_redrawn():
+    values = drawn("normal(0, 1, 0, 1)")
+    assert values.count(0.0) / len(values) == pytest.approx(0.5, abs=0.03)
+    assert values.count(1.0) / len(values) == pytest.approx(0.159, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("text", "typical"),
+    [
+        ("uniform(1, 3)", 2),
+        ("loguniform(1, 100)", 10),
+        ("normal(9, 1, 0, 5)", 5),
+        ("choice(7, 1)", 7),
+        ("randint(2, 5)", 2),
+    ],
+)
+def test_the_typical_value_is_the_middle_or_the_first(text, typical):
+    assert value(text)[0] == pytest.approx(typical)
+
+
+@pytest.mark.parametrize(
+    ("distribution", "asked", "given"),
+    [
+        (Distribution("choice", (math.pi / 6, math.pi / 3)), 1.0471975512, math.pi / 3),
+        (Distribution("choice", (0.0, 1.0)), 0.5, None),
+        (Distribution("normal", (0.0, 1.0, 0.0, 2 / 3)), 0.666666666667, 2 / 3),
+        (Distribution("uniform", (0.0, 1.0)), 0.25, 0.25),
+        (Distribution("uniform", (0.0, 1.0)), 1.1, None),
+        (Distribution("randint", (2.0, 5.0)), 3.0, 3),
+        (Distribution("randint", (2.0, 5.0)), 2.5, None),
+        (Distribution("randint", (2.0, 5.0)), 6.0, None),
+    ],
+)
+def test_a_value_rounded_for_a_file_is_recognized(distribution, asked, given):
+    assert distribution.closest(asked) == given
+
+
+def true_of(text, robot):
+    condition = parse_condition(text)
+    require_condition(condition)
+    return holds(condition, RobotProperties(robot))
+
+
+@pytest.fixture(scope="module")
+def gantry():
+    return join(parse_request(["base=gantry", "ee=cube"], LIBRARY), LIBRARY, "robot")
+
+
+def test_properties_of_a_robot(gantry):
+    properties = RobotProperties(gantry)
+    assert (properties.links, properties.dof, properties.movable) == (7, 5, 5)
+    assert properties.movable_to_tool == 5
+    assert properties.mass == pytest.approx(gantry.mass)
+    properties = RobotProperties(arm())  # a mimic joint moves and is not independent
+    assert (properties.links, properties.dof, properties.movable) == (6, 4, 5)
+    assert properties.movable_to_tool == 3
+
+
+def test_height_is_measured_at_the_highest_point_at_home():
+    straight = replace(arm(), home=(0.0, 0.0, 0.0, 0.0))
+    assert RobotProperties(straight).height == pytest.approx(0.05 + 0.3 + 0.3 + 0.2 + 0.1 - 0.03)
+    lying = replace(arm(), home=(np.pi / 2, 0.0, 0.0, 0.0))
+    assert RobotProperties(lying).height == pytest.approx(0.05 + 0.02, abs=1e-3)
+
+
+def test_reach_is_measured_from_the_root_and_undefined_without_a_tool():
+    assert RobotProperties(arm()).reach == pytest.approx(0.05 + 0.3 + 0.3 + 0.04 + 0.28, abs=0.02)
+    toolless = replace(arm(), frames=())
+    assert (RobotProperties(toolless).reach, RobotProperties(toolless).movable_to_tool) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("dof == 5", True),
+        ("links >= 7 and links <= 7", True),
+        ("links > 7 or links < 7", False),
+        ("not links > 7", True),
+        ("4 < dof < 6", True),
+        ("mass > 0g", True),
+        ("movable_to_tool + 2 == links", True),
+        ("reach / height > 0 and reach < 100m", True),
+        ("dof * 2 == 10 and not (dof == 4 or dof == 6)", True),
+    ],
+)
+def test_a_condition_evaluates_to_true_or_false(gantry, text, expected):
+    assert true_of(text, gantry) is expected
+
+
+def test_clauses_are_the_operands_of_and():
+    condition = parse_condition("mass < 4 and (dof > 2 or links > 3) and 1 < reach < 2")
+    assert [str(clause) for clause in clauses(condition)] == [
+        "(mass < 4)",
+        "((dof > 2) or (links > 3))",
+        "(1 < reach)",
+        "(reach < 2)",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("mas < 3", "1:1: unknown property 'mas'; did you mean 'mass'? valid: dof, height"),
+        ("mass", "1:1: mass is a value; a condition compares, such as mass < 40"),
+        ("reach < 3kg", "1:7: (reach < 3kg) compares kg with m"),
+        ("reach + mass < 3", "mixes units m and kg"),
+        ("mass < uniform(1, 2)", "1:8: a condition cannot draw values: uniform(1, 2)"),
+    ],
+)
+def test_conditions_without_a_value_are_errors(text, message):
+    with pytest.raises(GrammarError) as caught:
+        require_condition(parse_condition(text, "g"))
+    assert str(caught.value).startswith("g:")
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("name", PROPERTIES)
+def test_every_property_can_be_used_in_a_condition(gantry, name):
+    assert true_of(f"{name} >= 0", gantry)
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write a grammar file of some lines; return its path."""
+
+    def written(name, *lines):
+        path = tmp_path / f"{name}.grammar"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("\n".join(lines) + "\n")
+        return path
+
+    return written
+
+
+def first(grammar):
+    return str(derive(grammar, LIBRARY, FirstChooser()))
+
+
+def test_there_is_a_grammar_for_each_category_and_one_for_serial_arms():
+    assert " ".join(grammar_names()) == (
+        "arm3 arm5 arm_ed cartpole chain cubes multi_finger nlink panda_variations planar_arm "
+        "prims serial stick tongs"
+    )
+
+
+@pytest.mark.parametrize("name", CATEGORIES)
+def test_shipped_grammars_round_trip_through_printing(name):
+    text = grammar_text(shipped(name))
+    again = grammar_from_text(text, name)
+    assert grammar_text(again) == text
+    assert again.start == shipped(name).start
+    assert first(again) == first(shipped(name))
+
+
+def test_printing_preserves_every_language_feature():
+    lines = [
+        "let r = (0.1 * uniform(3.141592653589793mm, 1e-05m))",
+        "robot -> base left:limb right:limb | @weight((r / 2)) body(size=-(r + 1), x=r){2,7}",
+        "limb -> ur5",
+        "where not ((mass < 3kg) or (dof == 2))",
+        "where ((0.3 < reach) and (reach <= 1))",
+    ]
+    assert grammar_text(grammar(*lines)).splitlines() == lines
+
+
+def test_the_start_symbol_is_the_first_symbol_of_the_main_file(write):
+    write("limbs", "limb -> arm plane", "arm -> ur5 | panda")
+    path = write("mine", "include limbs", "include limbs", "robot -> fixed limb")
+    grammar = load_grammar(path, [path.parent])
+    assert (grammar.name, grammar.start) == ("mine", "robot")
+    assert grammar_text(grammar).startswith("robot -> ")
+    assert "arm=ur5" in first(grammar)
+
+
+def test_a_file_of_includes_only_has_the_start_symbol_of_the_included_file(write):
+    write("body", "robot -> gantry ee", "ee -> plane")
+    assert load_grammar(write("mine", 'include "body.grammar"', "let r = 1")).start == "robot"
+
+
+def test_a_file_overrides_included_definitions(write):
+    write("body", "let r = 5cm", "robot -> gantry ee", "ee -> plane(size=r)", "where dof > 2")
+    path = write("mine", 'include "body.grammar"', "let r = 8cm", "ee -> cube(size=r)")
+    grammar = load_grammar(path)
+    assert grammar_text(grammar).splitlines() == [
+        "let r = 8cm",
+        "ee -> cube(size=r)",
+        "robot -> gantry ee",
+        "where (dof > 2)",
+    ]
+
+
+def test_shipped_grammars_can_be_included_by_name(write):
+    path = write("mine", "include nlink", "robot -> post links jaw")
+    assert "end: jaw=jaw" in first(load_grammar(path))
+
+
+def test_user_libraries_take_precedence_over_shipped_grammars(write, tmp_path):
+    user_grammar = write("cubes", "robot -> cartpole")
+    assert find_grammar("cubes", [tmp_path]) == user_grammar
+    assert find_grammar("cubes") != user_grammar
+    with pytest.raises(GrammarError, match="unknown grammar 'kubes'; did you mean 'cubes'"):
+        find_grammar("kubes", [tmp_path])
+
+
+@pytest.mark.parametrize("target", ["a.grammar", "../{}/a.grammar", "./a.grammar"])
+def test_include_cycles_are_errors(write, tmp_path, target):
+    target = target.format(tmp_path.name)
+    path = write("a", 'include "b.grammar"', "robot -> cubes")
+    write("b", f'include "{target}"', "x -> cubes")
+    with pytest.raises(GrammarError, match=r"include each other: a\.grammar -> b\.grammar -> a"):
+        load_grammar(path)
+
+
+def test_two_files_may_include_the_same_third(write):
+    write("ends", "ee -> plane")
+    write("a", 'include "ends.grammar"', "x -> cubes")
+    write("b", 'include "ends.grammar"', "y -> cubes")
+    path = write("c", 'include "a.grammar"', 'include "b.grammar"', "robot -> gantry ee")
+    assert "plane" in first(load_grammar(path))
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (["robot -> a", "robot -> b"], "2:1: 'robot' is already defined at g:1:1"),
+        (["let r = 1", "let r = 2", "robot -> a"], "2:5: 'r' is already defined at g:1:5"),
+        (["let r = 1"], "g: no production, such as: robot -> base arm ee"),
+        ([""], "g: no production"),
+        (["robot -> a", "where size > 3"], "2:7: unknown property 'size'"),
+        (["include nlink", "robot -> a"], "1:9: a grammar given as text cannot include others"),
+    ],
+)
+def test_contradictory_grammars_are_errors(lines, message):
+    with pytest.raises(GrammarError) as caught:
+        grammar(*lines)
+    assert message in str(caught.value)
+
+
+def test_a_missing_include_is_reported_with_its_position(write):
+    path = write("mine", "robot -> cubes", "include nlnk")
+    with pytest.raises(GrammarError) as caught:
+        load_grammar(path)
+    assert str(caught.value).startswith(f"{path}:2:9: unknown grammar 'nlnk'; did you mean 'nlink'")
+    with pytest.raises(GrammarError, match="no such file"):
+        find_grammar(str(path.with_name("other.grammar")))
+
+
+def test_the_digest_covers_all_included_files(write):
+    write("body", "ee -> plane")
+    path = write("mine", 'include "body.grammar"', "robot -> gantry ee")
+    before = load_grammar(path).digest
+    assert load_grammar(path).digest == before
+    write("body", "ee -> cube")
+    assert load_grammar(path).digest != before
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "grammar.md").read_text(encoding="utf-8")
+EXAMPLES = re.findall(r"```grammar\n(.*?)```", PAGE, re.DOTALL)
+
+
+@pytest.fixture
+def load(tmp_path, monkeypatch):
+    """Read lines as the file ``my.grammar``."""
+    monkeypatch.chdir(tmp_path)
+
+    def loaded(text):
+        Path("my.grammar").write_text(text)
+        return load_grammar(find_grammar("my.grammar"))
+
+    return loaded
+
+
+@pytest.mark.parametrize("text", EXAMPLES)
+def test_examples_have_no_faults_and_can_be_sampled(load, text):
+    grammar = load(text)
+    assert check_grammar(grammar, LIBRARY) == []
+    for drawn in sample_robots(grammar, LIBRARY, 3):
+        assert unphysical(drawn.robot) == []
+        assert any(frame.name == "tool" for frame in drawn.robot.frames)
+
+
+def test_an_unsatisfiable_condition_raises_an_error_that_names_it():
+    message = "robot 0 of 'cubes': 0 of 500 draws were accepted; 500 failed at: where (mass > 900)"
+    with pytest.raises(SamplingError) as caught:
+        next(sample_robots(shipped("cubes"), LIBRARY, 1, where=[parse_condition("mass > 900")]))
+    assert str(caught.value) == message
+
+
+def test_all_units_distributions_and_properties_are_documented():
+    for name in (*(f"`{d}(" for d in DISTRIBUTIONS), *(f"`{p}`" for p in PROPERTIES)):
+        assert name in PAGE
+    (units,) = re.findall(r"\*\*Units\*\* are (.*?)\.", PAGE)
+    assert set(units.split(", ")) == set(UNITS)
+    assert len(EXAMPLES) == 2
+    assert pin(shipped("chain"), ["beads=5", "bead.rod=3cm", "radius=2cm"], LIBRARY)
+
+
+def test_the_index_has_the_documented_fields(tmp_path):
+    (row,) = re.findall(r"\| `index\.jsonl` \| one line per robot: (.*?) \|", PAGE)
+    named = set(row.replace("rejected draws", "rejected").split(", "))
+    plan = SetConfig(tmp_path / "s", "g", "robot -> cubes\n", 0, (), True, False, ())
+    make_set(plan, 1, make_in_processes())
+    record = json.loads((tmp_path / "s" / "index.jsonl").read_text())
+    assert set(record) - {"index"} == named
+
+
+def structures(robot_grammar, limit=None):
+    return [str(d) for d in itertools.islice(enumerate_structures(robot_grammar, LIBRARY), limit)]
+
+
+@pytest.mark.parametrize("name", CATEGORIES)
+def test_shipped_grammars_are_sound(name):
+    assert check_grammar(shipped(name), LIBRARY) == []
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (["robot -> fixed urr5"], "g:1:16: 'urr5' is neither a symbol nor a part; did you mean"),
+        (["robot -> fixed a(x=1)", "a -> ur5"], "g:1:16: 'a' is a symbol and takes no parameters"),
+        (["robot -> gantry plane(sise=1)"], "g:1:28: 'plane' has no parameter 'sise'"),
+        (["robot -> gantry plane(size=1kg)"], "g:1:28: size is in m, 1kg in kg"),
+        (["robot -> gantry plane(size=uniform(0.1, 2))"], "g:1:28: plane.size=2: out of range"),
+        (["let s = uniform(1, 4)", "robot -> gantry plane(size=s/2)"], "plane.size=2: out of"),
+        (["robot -> slides hand(palm=0, fingers=uniform(2, 4))"], "hand.fingers=2.76393: not a wh"),
+        (["let s = uniform(2, 1)", "robot -> cubes(size=s)"], "g:1:9: uniform(2, 1): low is above"),
+        (["robot -> slides bead robot"], "g:1:1: 'robot' never ends: it always holds itself"),
+        (["robot -> gantry a", "a -> plane | a"], "g:2:1: 'a' can be rewritten to itself alone"),
+        (["robot -> cubes", "a -> cubes"], "g:2:1: 'a' cannot be reached from 'robot'"),
+        (["let r = 1", "robot -> cubes"], "g:1:5: 'r' is never used"),
+        (["robot -> pedestal up:ur5"], "g:1:22: 'pedestal' has no port 'up'"),
+        (["robot -> gantry plane cube"], "g:1:23: nothing can be attached to 'plane': it has no"),
+        (["robot -> cubes | ur5(mount_yaw=1)"], "'ur5' is not attached to a port: it has no"),
+        (["robot -> yumi_gripper"], "g:1:1: 'yumi_gripper' needs a base: its mount"),
+        (["robot -> @weight(0) cubes"], "g:1:1: all weights of 'robot' are zero"),
+    ],
+)
+def test_a_fault_is_reported_with_line_and_column(lines, message):
+    faults = check_grammar(grammar(*lines), LIBRARY)
+    assert faults
+    assert any(message in fault for fault in faults)
+    assert all(fault.startswith("g:") and "\n" not in fault for fault in faults)
+
+
+def test_all_faults_are_reported_together():
+    wrong = grammar("let r = 1", "robot -> gantri plane(sise=1)", "a -> ur55")
+    faults = [fault.split(": ")[0] for fault in check_grammar(wrong, LIBRARY)]
+    assert faults == ["g:2:10", "g:2:28", "g:3:6", "g:3:1", "g:1:5"]
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [  # values that weights or other values name are used; a recursion may end
+        ("let a = 1", "let b = a", "robot -> @weight(b) cubes | cartpole"),
+        ("robot -> slides tail", "tail -> bead tail | bead"),
+    ],
+)
+def test_sound_grammars_have_no_faults(lines):
+    assert check_grammar(grammar(*lines), LIBRARY) == []
+
+
+@pytest.mark.parametrize(
+    ("lines", "number"),
+    [
+        (["robot -> cubes"], 1),
+        (["robot -> cubes | cartpole | post"], 3),
+        (["robot -> post beam{2,5}"], 4),
+        (["robot -> post beam{3}"], 1),
+        (["robot -> post link{1,3}", "link -> beam | bead"], 2 + 4 + 8),
+        (["robot -> post link{1,2} ee", "link -> beam{1,2} | bead", "ee -> jaw | claw"], 24),
+        (["robot -> base arm jaw", "base -> fixed | post", "arm -> ur5 | ur3 | beam"], 6),
+        (["robot -> pedestal left:l right:l", "l -> a e", "a -> ur5 | ur3", "e -> jaw | claw"], 16),
+        (["robot -> gantry ee", "ee -> @weight(0) plane | cube | jaw"], 2),
+    ],
+)
+def test_the_structure_count_equals_the_number_of_distinct_listed_structures(lines, number):
+    robot_grammar = grammar(*lines)
+    listed = structures(robot_grammar)
+    assert count_structures(robot_grammar) == number == len(listed) == len(set(listed))
+
+
+def test_the_list_contains_exactly_the_structures_that_sampling_draws():
+    robot_grammar = grammar(
+        "robot -> post link{1,2} ee", "link -> beam{1,2} | bead", "ee -> jaw | claw"
+    )
+    rng = np.random.default_rng(0)
+    drawn = {str(derive(robot_grammar, LIBRARY, RandomChooser(rng))) for _ in range(600)}
+    assert drawn == set(structures(robot_grammar))
+
+
+def test_duplicate_alternatives_are_listed_once():
+    robot_grammar = grammar("robot -> gantry ee", "ee -> plane | plane | cube")
+    assert count_structures(robot_grammar) == 3
+    assert len(structures(robot_grammar)) == 2
+
+
+def test_structures_of_a_recursive_grammar_are_listed_by_size():
+    robot_grammar = grammar("robot -> slides tail", "tail -> bead | beam tail")
+    assert math.isinf(count_structures(robot_grammar))
+    listed = structures(robot_grammar, 6)
+    assert [text.count("=bead") + text.count("=beam") for text in listed] == [1, 2, 3, 4, 5, 6]
+    assert len(set(listed)) == 6
+
+
+def test_an_impossible_structure_raises_when_it_is_reached():
+    wrong = grammar("robot -> gantry ee", "ee -> plane | plane cube")
+    listed = enumerate_structures(wrong, LIBRARY)
+    assert next(listed).part == "gantry"
+    with pytest.raises(GrammarError, match="g:2:21: nothing can be attached to 'plane'"):
+        next(listed)
+
+
+def test_shipped_grammars_have_the_documented_number_of_structures():
+    expected = {"chain": 6, "nlink": 4, "planar_arm": 8, "prims": 4, "arm3": 1}
+    assert {name: count_structures(shipped(name)) for name in expected} == expected
+
+
+def test_every_random_choice_is_listed_with_its_distribution():
+    random_choices = variables(
+        grammar(
+            "let r = uniform(1cm, 2cm)",
+            "let n = 3",
+            "robot -> slides(radius=r) link{2,3}",
+            "link -> bead(radius=r, rod=choice(2cm, r) + uniform(0, 5*r))",
+        )
+    )
+    assert [(v.location, v.text, v.distribution.is_continuous) for v in random_choices] == [
+        ("let r", "uniform(1cm, 2cm)", True),
+        ("link: bead.rod", "choice(2cm, r)", False),
+        ("link: bead.rod", "uniform(0, (5 * r))", True),
+    ]
+    assert random_choices[2].distribution.bounds == pytest.approx((0, 0.075))

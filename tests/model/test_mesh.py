@@ -1,20 +1,31 @@
-"""Loading meshes: formats, units, colours, caching, convex hulls and errors."""
+"""Meshes and their files."""
 
+import base64
 import importlib.metadata
+import io
+import json
 import os
+import struct
+import warnings
+import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from helpers.collada import DAE
+from helpers.faulty_robots import with_shape
 from morphgen.checks import check
 from morphgen.errors import MeshError
 from morphgen.model import mesh_files
 from morphgen.model.geometry import Mesh, Shape
 from morphgen.model.mesh import convex_hull, load_mesh, mesh_parts
+from morphgen.model.mesh_files import read_mesh_file
 from morphgen.model.robot import Link, Robot
+from morphgen.model.scene_files import MAX_PIXELS, read_picture
 
 DATA = Path(str(importlib.metadata.distribution("rtb-data").locate_file("rtbdata/xacro")))
 RED, BLUE = (1.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 1.0)
@@ -184,3 +195,457 @@ def test_a_collada_geometry_whose_material_is_broken_is_read_without_colours(tmp
     path = dae(tmp_path / "m.dae")
     path.write_text(path.read_text().replace('-fx"/>', '-missing"/>'))
     assert counts(path) == [(None, 4)]
+
+
+CORNERS = [(0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3)]
+FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
+"""A tetrahedron."""
+
+
+def read(folder, name, content):
+    if isinstance(content, dict):
+        content = json.dumps(content)
+    data = content.encode() if isinstance(content, str) else content
+    (folder / name).write_bytes(data)
+    return read_mesh_file(folder / name)
+
+
+def count(content):
+    return sum(len(part.faces) for part in content.parts)
+
+
+def volume(content):
+    corners = np.concatenate([part.vertices[part.faces] for part in content.parts])
+    return float(np.linalg.det(corners).sum() / 6)
+
+
+def binary_stl(faces=4, stated=None):
+    rows = [
+        struct.pack("<12fH", 0, 0, 0, *(x for corner in FACES[i % 4] for x in CORNERS[corner]), 0)
+        for i in range(faces)
+    ]
+    return bytes(80) + struct.pack("<I", faces if stated is None else stated) + b"".join(rows)
+
+
+def ascii_stl(faces, name="a", end=True):
+    lines = [f"solid {name}"]
+    for i in faces:
+        corners = "\n".join("vertex {} {} {}".format(*CORNERS[k]) for k in FACES[i])
+        lines.append(f"facet normal 0 0 0\nouter loop\n{corners}\nendloop\nendfacet")
+    return "\n".join([*lines, f"endsolid {name}" if end else ""]) + "\n"
+
+
+def ply(rows: list[str], *elements: str, style: str = "ascii") -> str:
+    header = [f"ply\nformat {style} 1.0", *elements, "end_header"]
+    return "\n".join([*header, *rows]) + "\n"
+
+
+PLY_VERTICES = "element vertex 4\nproperty float x\nproperty float y\nproperty float z"
+PLY_POINTS = ["0 0 0", "1 0 0", "0 2 0", "0 0 3"]
+PLY_LIST = "property list uchar int vertex_indices"
+
+
+def gltf(**changes: Any) -> dict[str, Any]:
+    data = np.array(CORNERS, "<f4").tobytes() + np.array(FACES, "<u2").tobytes()
+    uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+    document = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "buffers": [{"byteLength": 72, "uri": uri}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": 48},
+            {"buffer": 0, "byteOffset": 48, "byteLength": 24},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5123, "count": 12, "type": "SCALAR"},
+        ],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+    }
+    return {**document, **changes}
+
+
+def accessor(index: int, **changes: Any) -> dict[str, Any]:
+    document = gltf()
+    document["accessors"][index].update(changes)
+    return document
+
+
+def picture(size=(2, 2), claimed=None):
+    """Return a green PNG, whose header may claim another size."""
+    stream = io.BytesIO()
+    Image.new("RGB", size, "lime").save(stream, "PNG")
+    data = stream.getvalue()
+    if claimed is None:
+        return data
+    header = data[12:16] + struct.pack(">II", *claimed) + data[24:29]
+    return data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
+
+
+def dae_of(**changes: str) -> str:
+    text = DAE.format(unit=1, up="Z_UP", shift="0 0 0")
+    for old, new in changes.values():
+        assert old in text
+        text = text.replace(old, new)
+    return text
+
+
+def dae_with(primitive):
+    first, rest = dae_of().split("<triangles", 1)
+    return first + primitive + rest.split("</triangles>")[-1]
+
+
+INPUT = '<input semantic="VERTEX" source="#v" offset="0"/>'
+TRIANGLES = f'<triangles count="4">{INPUT}<p>0 2 1 0 1 3 0 3 2 1 2 3</p></triangles>'
+SKIN = """<library_controllers><controller id="c"><skin source="#g">
+<bind_shape_matrix>1 0 0 5 0 1 0 0 0 0 1 0 0 0 0 1</bind_shape_matrix></skin></controller>
+<controller id="m"><morph source="#g"/></controller>
+<controller id="cm"><skin source="#m"/></controller></library_controllers><library_visual_scenes>"""
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("two_solids.stl", ascii_stl([0, 1]) + ascii_stl([2, 3], "b", end=False)),
+        ("upper.stl", ascii_stl([0, 1, 2, 3]).upper()),
+        ("vertex.stl", ascii_stl([0, 1, 2, 3], "vertex of facet")),
+        ("concatenated.stl", binary_stl(2) + binary_stl(4)[:80] + struct.pack("<I", 2)
+         + binary_stl(4)[-100:]),
+        ("indented.obj", "\tv 0 0 0\n v 1 0 0\nv\t0 2 0\nv 0 0 3\n f 1 3 2\nf\t1 2 4\nf 1 4 3 # x\n"
+         "f 2 3 4\n"),
+        ("negative.obj", "v 0 0 0\nv 1 0 0\nv 0 2 0\nf -3 -1 -2\nv 0 0 3\nf 1 2 -1\nf -4 -1 -2\n"
+         "f 2 3 4\n"),
+        ("mixed.obj", "v 0 0 0\nv 1 0 0\nv 0 2 0\nv 0 0 3\nvt 0 0\nvn 0 0 1\nf 1//1 3//1 2//1\n"
+         "f 1/1 2/1 4/1\nf 1 4/1 3//1\nf 2/1/1 3 4\n"),
+        ("lists.ply", ply([*PLY_POINTS, "3 0 2 1", "3 0 1 3", "3 0 3 2", "3 1 2 3"],
+                          PLY_VERTICES, "element face 4", PLY_LIST)),
+        ("gltf.gltf", gltf()),
+        ("polylist.dae", dae_with(f'<polylist count="4">{INPUT}<vcount>3 3 3 3</vcount>'
+                                  "<p>0 2 1 0 1 3 0 3 2 1 2 3</p></polylist>")),
+        ("polygons.dae", dae_with(f'<polygons count="4">{INPUT}<p>0 2 1</p><p>0 1 3</p>'
+                                  "<p>0 3 2</p><p>1 2 3</p></polygons>")),
+        ("fans.dae", dae_with(f'<trifans count="2">{INPUT}<p>3 0 1 2 0</p><p>0 2 1</p></trifans>')),
+        ("strips.dae", dae_with(f'<tristrips count="1">{INPUT}<p>0 2 1 3 0 2</p></tristrips>')),
+    ],
+)  # fmt: skip
+def test_every_form_of_a_tetrahedron_is_read_whole(name, content, tmp_path):
+    mesh = read(tmp_path, name, content)
+    assert count(mesh) == 4
+    assert mesh.left_out == ()
+    assert volume(mesh) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("rows", "elements", "triangles", "notes"),
+    [
+        (["4 0 1 2 3", "3 0 1 2"], ["element face 2", PLY_LIST], 3, ()),
+        (["5 0 1 2 3 0", "2 0 1"], ["element face 2", PLY_LIST], 3, ("1 faces of 2 vertices",)),
+        (["3 0 1 2", "0 1"], ["element face 1", PLY_LIST, "element edge 1\nproperty int vertex1\n"
+         "property int vertex2"], 1, ("1 elements 'edge'",)),
+        (["3 0 1 2", "4 0 1 2 3"], ["element face 1", PLY_LIST, "element tristrips 1", PLY_LIST], 1,
+         ("1 elements 'tristrips'",)),
+        (["3 0 1 2"], ["comment TextureFile a.png", "element face 1", PLY_LIST], 1,
+         ("texture 'a.png'",)),
+    ],
+)  # fmt: skip
+def test_polygons_of_a_ply_are_triangles_and_the_rest_is_counted(
+    rows, elements, triangles, notes, tmp_path
+):
+    mesh = read(tmp_path, "m.ply", ply([*PLY_POINTS, *rows], PLY_VERTICES, *elements))
+    assert (count(mesh), mesh.left_out) == (triangles, notes)
+
+
+@pytest.mark.parametrize("order", ["little", "big"])
+def test_a_binary_ply_of_triangles_and_quads_with_colours_is_read(order, tmp_path):
+    code = "<" if order == "little" else ">"
+    header = ply(
+        [],
+        PLY_VERTICES,
+        "property uchar red\nproperty uchar green\nproperty uchar blue",
+        "element face 2",
+        PLY_LIST,
+        style=f"binary_{order}_endian",
+    ).encode()
+    points = b"".join(struct.pack(f"{code}3f3B", *p, 255, 0, 0) for p in CORNERS)
+    faces = struct.pack(f"{code}B3iB4i", 3, 0, 1, 2, 4, 0, 1, 2, 3)
+    mesh = read(tmp_path, "m.ply", header + points + faces)
+    assert count(mesh) == 3
+    assert mesh.parts[0].rgba == (1, 0, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("instance", "notes"),
+    [
+        ("c", ("a skin, whose mesh is drawn at rest",)),
+        ("m", ("morph targets, whose mesh is drawn at rest",)),
+        ("cm", ("a skin, whose mesh is drawn at rest",
+                "morph targets, whose mesh is drawn at rest")),
+    ],
+)  # fmt: skip
+def test_a_skin_or_morph_of_a_collada_file_is_read_at_rest(instance, notes, tmp_path):
+    text = dae_of(
+        skin=("<library_visual_scenes>", SKIN),
+        node=("</visual_scene>", f'<node><instance_controller url="#{instance}"/></node>'
+              "</visual_scene>"),
+    )  # fmt: skip
+    mesh = read(tmp_path, "mesh_with_skin.dae", text)
+    assert count(mesh) == 8
+    assert mesh.left_out == notes
+    highest = max(part.vertices[:, 0].max() for part in mesh.parts)
+    assert highest == (6 if instance == "c" else 1)
+
+
+LINES = f'<lines count="1">{INPUT}<p>0 1</p></lines>'
+SOLID_OBJ = "v 0 0 0\nv 1 0 0\nv 0 2 0\nv 0 0 3\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+NOTED = {
+    "lines.dae": (dae_with(TRIANGLES + LINES), "1 line sets"),
+    "linestrips.dae": (dae_with(TRIANGLES + LINES.replace("lines", "linestrips")), "1 line strips"),
+    "lost.dae": (
+        dae_of(n=("</node>", '</node><node><instance_geometry url="b.dae#x"/></node>')),
+        "1 instances of 'b.dae#x', which the file does not define",
+    ),
+    "texture.dae": (
+        dae_of(t=("<color>1 0 0 1</color>", '<texture texture="nosuch" texcoord="UV"/>')),
+        "texture 'nosuch', which the file does not define",
+    ),
+    "tail.stl": (binary_stl() + b"more", "4 bytes after the last triangle"),
+    "points.gltf": (
+        gltf(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1},
+                                     {"attributes": {"POSITION": 0}, "mode": 0}]}]),
+        "point sets of a mesh",
+    ),
+    "skin.gltf": (
+        gltf(nodes=[{"mesh": 0, "skin": 0}]),
+        "a skin, whose mesh is drawn as it lies in the file",
+    ),
+    "unplaced.gltf": (
+        gltf(meshes=gltf()["meshes"] * 2), "1 meshes that its scene does not place"
+    ),
+    "weights.gltf": (
+        gltf(meshes=[{**gltf()["meshes"][0], "weights": [1]}]),
+        "the default weights of morph targets",
+    ),
+    "lines.obj": (
+        SOLID_OBJ + "l 1 2\nl 2 3\np 1\n",
+        "2 lines",
+    ),
+    "surface.obj": (
+        SOLID_OBJ + "surf 0 1 0 1 1 2\n",
+        "1 free-form curves and surfaces",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NOTED)
+def test_what_is_left_out_is_counted_and_is_a_finding(name, tmp_path):
+    content, note = NOTED[name]
+    mesh = read(tmp_path, name, content)
+    assert count(mesh) == 4
+    assert note in mesh.left_out
+    found = [f for f in check(with_shape(Mesh(tmp_path / name))) if f.code == "mesh-left-out"]
+    without_triangles = ("lines.dae", "linestrips.dae", "texture.dae", "lines.obj")
+    assert [f.severity for f in found] == ["info" if name in without_triangles else "warning"]
+    assert note in found[0].why
+
+
+OBJ = (
+    "v 0 0 0\nv 1 0 0\nv 0 2 0\nv 0 0 3\nvt 0 0\nusemtl a\nf 1/1 3/1 2/1\nusemtl b\nf 1/1 2/1 4/1\n"
+)
+BLUE_OF_FILE, GREEN = (0.2, 0.4, 0.6, 1.0), (0.0, 1.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("properties", "alpha"),
+    [
+        ("d 0.5", 128), ("Tr 0.8", 51), ("d -halo 0.25", 64), ("Tr 0.2\nd 0.5", 128), ("", 255),
+        ("Tr 1", 255), ("Tr 0", 255), ("d x", 255), ("d 7", 255),
+    ],
+)  # fmt: skip
+def test_the_opacity_of_a_material_is_read(properties, alpha, tmp_path):
+    (tmp_path / "m.mtl").write_text(f"newmtl a\nKd 0.2 0.4 0.6\n{properties}\nnewmtl b\nKd 0 1 0\n")
+    mesh = read(tmp_path, "e_d_alpha.obj", "mtllib m.mtl\n" + OBJ)
+    assert {part.rgba for part in mesh.parts} == {(*BLUE_OF_FILE[:3], alpha / 255), GREEN}
+
+
+@pytest.mark.parametrize(
+    "libraries", ["mtllib a.mtl\nmtllib b c.mtl\n", "mtllib a.mtl x.mtl\nmtllib b c.mtl\n"]
+)
+def test_all_material_files_are_read(libraries, tmp_path):
+    (tmp_path / "a.mtl").write_text("newmtl a\nKd 0.2 0.4 0.6")
+    (tmp_path / "b c.mtl").write_text("newmtl b\nKd 0 1 0\n")
+    mesh = read(tmp_path, "m.obj", libraries + OBJ)
+    assert {part.rgba for part in mesh.parts} == {BLUE_OF_FILE, GREEN}
+    expected = ("material file 'x.mtl': no such file",) if "x.mtl" in libraries else ()
+    assert mesh.left_out == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        ("none.png", None, "no such file"),
+        ("junk.png", b"junk", "not a picture"),
+        ("cut.png", picture((90, 90))[:70], "a broken picture"),
+        ("bomb.png", picture(claimed=(8192, 4097)), f"8192 x 4097 pixels; at most {MAX_PIXELS}"),
+        ("../out.png", picture(), "is outside the mesh's folder"),
+        ("post.png", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\n",
+         "not a picture"),
+    ],
+)  # fmt: skip
+def test_without_its_texture_a_material_has_its_own_colour(name, content, reason, tmp_path):
+    (tmp_path / "f").mkdir()
+    if content is not None:
+        (tmp_path / "f" / name).write_bytes(content)
+    (tmp_path / "f" / "m.mtl").write_text(
+        f"newmtl a\nKd 0.2 0.4 0.6\nmap_Kd {name}\nnewmtl b\nKd 0 1 0\n"
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mesh = read(tmp_path / "f", "m.obj", "mtllib m.mtl\n" + OBJ)
+        document = gltf(
+            materials=[{"pbrMetallicRoughness": {"baseColorFactor": BLUE_OF_FILE,
+                                                 "baseColorTexture": {"index": 0}}}],
+            textures=[{"source": 0}],
+            images=[{"uri": name}],
+        )  # fmt: skip
+        document["meshes"][0]["primitives"][0]["material"] = 0
+        other = read(tmp_path / "f", "m.gltf", document)
+    assert {part.rgba for part in mesh.parts} == {BLUE_OF_FILE, GREEN}
+    assert {part.rgba for part in other.parts} == {BLUE_OF_FILE}
+    for notes in (mesh.left_out, other.left_out):
+        assert len(notes) == 1
+        assert notes[0].startswith(f"texture {name!r}: ")
+        assert reason in notes[0]
+
+
+def test_a_texture_of_65_megapixels_is_refused_without_a_warning(tmp_path):
+    path = tmp_path / "a.png"
+    path.write_bytes(picture(claimed=(13000, 13000)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(ValueError, match=r"13000 x 13000 pixels"):
+            read_picture(path)
+
+
+def many_nodes():
+    return gltf(nodes=[{"mesh": 0}] * 6000, scenes=[{"nodes": [*range(6000)]}])
+
+
+def nested_nodes(levels):
+    """A COLLADA scene of 2^levels nodes."""
+    nodes = "".join(
+        f'<node id="n{i}">' + f'<instance_node url="#n{i - 1}"/>' * 2 + "</node>"
+        for i in range(1, levels)
+    )
+    last = f'<visual_scene id="s"><node><instance_node url="#n{levels - 1}"/></node>'
+    library = f'<library_nodes><node id="n0"/>{nodes}</library_nodes><library_visual_scenes>'
+    return dae_of(n=("<library_visual_scenes>", library), s=('<visual_scene id="s">', last))
+
+
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
+REFUSED: dict[str, tuple[Any, str]] = {
+    # more entries than bytes
+    "ga_pos19.gltf": (
+        gltf(accessors=[{"componentType": 5126, "count": 19_000_000, "type": "VEC3"},
+                        gltf()["accessors"][1]]),
+        "accessor 0 is without a buffer view",
+    ),
+    "many.gltf": (accessor(0, count=19_000_000), "accessor 0 counts 19000000 entries of 12 bytes"),
+    "negative.gltf": (accessor(1, count=-(2**40)), "-1099511627776 is not a count"),
+    "offset.gltf": (accessor(0, byteOffset=40), "accessor 0 counts 4 entries of 12 bytes"),
+    "sparse.gltf": (accessor(0, sparse={"count": 1}), "accessor 0 is sparse"),
+    "stride.gltf": (
+        gltf(bufferViews=[{"buffer": 0, "byteLength": 48, "byteStride": 1},
+                          gltf()["bufferViews"][1]]),
+        "a stride of 1 bytes",
+    ),
+    "view.gltf": (gltf(bufferViews=[{"buffer": 0, "byteLength": 10**12}]), "ends at byte 10000"),
+    "overlap.gltf": (
+        gltf(accessors=[gltf()["accessors"][0]] * 2 ** 16), "more than 500000 JSON values"
+    ),
+    "cycle.gltf": (gltf(nodes=[{"mesh": 0, "children": [0]}]), "node 0 has two parents"),
+    "instances.gltf": (many_nodes(), "6000 sets of triangles; at most 5000"),
+    "draco.gltf": (
+        gltf(extensionsRequired=["KHR_draco_mesh_compression"]),
+        "requires the extension KHR_draco_mesh_compression, which is not read",
+    ),
+    "normalised.gltf": (accessor(0, normalized=True), "normalised integers"),
+    "sixteen.dae": (dae_of().encode("utf-16"), "expected UTF-8"),
+    "seven.dae": ('<?xml version="1.0" encoding="UTF-7"?>' + dae_of()[38:], "encoding 'utf-7'"),
+    "instances.dae": (
+        dae_of(n=("</visual_scene>", '<node><instance_geometry url="#g"/></node>' * 20_001
+               + "</visual_scene>")),
+        "nodes; at most 20000 are read",
+    ),
+    "nodes.dae": (nested_nodes(40), "nodes; at most 20000 are read"),
+    "entity.dae": (dae_of(x=("<COLLADA", '<!DOCTYPE r [<!ENTITY e "a">]><COLLADA')), "DOCTYPE"),
+    "deep.dae": (b"<COLLADA>" + b"<a>" * 100_000, "depth"),
+    "deep.gltf": (b'{"a":' + b"[" * 100_000, "not a readable gltf mesh"),
+    "deep.glb": (
+        b"glTF" + struct.pack("<IIII", 2, 100_020, 100_000, 0x4E4F534A) + b"[" * 100_000,
+        "not a readable glb mesh",
+    ),
+    "triangles.dae": (
+        dae_with(f'<polylist count="1">{INPUT}<vcount>3000000</vcount><p>0 1 2</p></polylist>'),
+        "2999998 triangles; at most 1000000",
+    ),
+    "elements.dae": (
+        dae_of(s=("</library_visual_scenes>", "<a/>" * 500_000 + "</library_visual_scenes>")),
+        "more than 500000 elements",
+    ),
+    "properties.ply": (
+        ply([], "element vertex 1", *(f"property float p{i}" for i in range(200_000))),
+        "no PLY header of at most 65536 bytes",
+    ),
+    "vertices.ply": (
+        ply([], PLY_VERTICES.replace("4", "2000000000"), style="binary_little_endian"),
+        "counts 2000000000 of element 'vertex', more than the file has bytes for",
+    ),
+    "list.ply": (
+        ply([*PLY_POINTS, "1000000000 0 1 2"], PLY_VERTICES, "element face 1", PLY_LIST),
+        "a list of 1000000000 entries",
+    ),
+    "less.ply": (ply([], PLY_VERTICES.replace("4", "-4")), "counts -4 of element 'vertex'"),
+    "face.obj": ("v 0 0 0\nf" + " 1" * 40_000 + "\n", "a line has more than 65536 characters"),
+    "fan.obj": ("v 0 0 0\nf" + " 1" * 1_100_000 + "\n", "a line has more than 65536 characters"),
+    "faces.obj": ("v 0 0 0\n" + ("f" + " 1" * 30_000 + "\n") * 40, "1199920 triangles"),
+    "index.obj": ("v 0 0 0\nf 1 2 99999999999\n", "is out of bounds"),
+    "zero.obj": ("v 0 0 0\nv 0 0 1\nv 0 1 1\nf 0 1 2\n", "index '0' of a face"),
+    "materials.obj": (
+        OBJ + "".join(f"usemtl m{i}\nf 1 2 3\n" for i in range(5001)), "5003 materials"
+    ),
+    # the true reason
+    "empty.stl": (b"", "the file is empty"),
+    "junk.glb": (b"glTF\x02\x00", "does not begin as a binary glTF file"),
+    "nan.obj": (b"v nan 0 0\nv 1 0 0\nv 2 1 0\nf 1 2 3\n", "a vertex is not finite"),
+    "inf.obj": (b"v 1e999 0 0\nv 1 0 0\nv 2 1 0\nf 1 2 3\n", "a vertex is not finite"),
+    "a.step": (b"x", "cannot read '.step' meshes; valid: .dae"),
+    "pointer.stl": (LFS, "the file is a Git LFS pointer; run 'git lfs pull'"),
+    "page.obj": (b"<!DOCTYPE html>\n<html></html>", "the file is a web page"),
+    "other.stl": (b"glTF" + bytes(100), "the file has the content of a .glb file; rename it"),
+    "other.obj": (ascii_stl([0]).encode(), "the file has the content of a .stl file"),
+    "other.ply": (dae_of().encode(), "the file has the content of a .dae file"),
+    "cut.stl": (binary_stl()[:200], "4 triangles, which take 284 bytes, and the file has 200"),
+    "short.stl": (binary_stl()[:60], "60 bytes; a binary STL file has at least 84"),
+    "text.stl": (ascii_stl([0, 1])[:-70].encode(), "truncated or malformed"),
+    "cut.glb": (b"glTF" + struct.pack("<IIII", 2, 9999, 5000, 0) + b"{}", "it is truncated"),
+    "cut.ply": (
+        ply([*PLY_POINTS, "3 0 1 2"], PLY_VERTICES, "element face 9", PLY_LIST),
+        "counts 9 of element 'face', more than the file has bytes for: it is truncated",
+    ),
+    "none.stl": (b"solid x\nendsolid x\n", "holds no triangle"),
+    "solid.stl": (b"solid" + bytes(2**20), "holds no triangle"),
+    "none.obj": (b"v 0 0 0\nl 1 1\n", "holds 1 vertices and no triangle"),
+    "none.ply": (ply(PLY_POINTS, PLY_VERTICES), "holds 4 vertices and no triangle"),
+    "none.gltf": (gltf(scenes=[{"nodes": []}]), "its scene holds no triangle"),
+    "none.dae": (dae_with(LINES), "its scene holds no triangle"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_refused_file_is_named_with_the_true_reason(name, tmp_path):
+    content, reason = REFUSED[name]
+    with pytest.raises(MeshError, match=reason) as caught:
+        read(tmp_path, name, content)
+    assert str(caught.value).startswith(f"{tmp_path / name}: ")
+    assert "\n" not in str(caught.value)

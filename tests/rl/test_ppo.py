@@ -1,18 +1,26 @@
-"""Parts of PPO against known values, and the whole on a task that it must solve."""
+"""PPO: rollouts, updates, and intervals of scores."""
 
 import functools
 import math
+from contextlib import closing
 from dataclasses import replace
+from itertools import product
 
+import numpy as np
 import pytest
 import torch
 from torch._dynamo.exc import TorchDynamoException
 
+from helpers.device_reads import device_reads
+from helpers.goal_sets import draw_spec
 from helpers.learners import SMALL, equal, learner, weights
 from helpers.line_batch import OnALine
+from helpers.scenes import robot
 from morphgen.errors import TaskError
+from morphgen.rl.baselines.simple import Zero
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.distributed import ProcessGroup
+from morphgen.rl.inference import make_env_and_controller, play, read_controller, run_episodes
 from morphgen.rl.ppo import (
     KL_FACTOR,
     MIN_ACTOR_LR_SCALE,
@@ -26,6 +34,17 @@ from morphgen.rl.ppo import (
     symexp,
     symlog,
 )
+from morphgen.rl.scores import (
+    Interval,
+    episode_interval,
+    iqm_interval,
+    stratified_mean_interval,
+    success_interval,
+)
+from morphgen.tasks.observation import ObservationConfig
+from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.scenes.make import batch_from_specs, make_batch
+from morphgen.tasks.sim import base
 
 
 def test_policy_loss_by_hand():
@@ -405,3 +424,187 @@ def test_the_loss_of_a_gpu_has_the_gradients_of_actor_and_critic():
     others = torch.autograd.grad(apart[0][0], [*trainer.actor.parameters()])
     others += torch.autograd.grad(apart[1][0], [*trainer.critic.parameters()])
     assert all(map(torch.equal, gradients, others))
+
+
+@pytest.fixture
+def two_threads():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    assert torch.get_num_threads() == 2
+    torch.set_num_threads(threads)
+
+
+class Counting(Zero):
+    """Controller that records the number of threads in which it acts."""
+
+    def __init__(self):
+        super().__init__(0)
+        self.threads = set()
+
+    def act(self, task):
+        self.threads.add(torch.get_num_threads())
+        return super().act(task)
+
+
+def test_episodes_run_in_one_thread(two_threads):
+    controller = Counting()
+    run_episodes(make_batch("reach", ["stick"], 1, sim="mujoco"), controller, 1)
+    assert controller.threads == {1}
+
+
+def test_played_episodes_run_in_one_thread(two_threads, tmp_path):
+    spec = read_controller("zero", "reach")
+    env, _ = make_env_and_controller(spec, "stick", 0, sim="mujoco", cache=tmp_path)
+    controller = Counting()
+    with closing(env):
+        list(play(env, controller, 1, 0, lambda episode: None))
+    assert controller.threads == {1}
+
+
+def test_an_episode_ends_early_after_successes_in_a_row(tmp_path):
+    spec = read_controller("ik", "reach")
+    env, controller = make_env_and_controller(spec, "arm3-stick", 0, sim="mujoco", cache=tmp_path)
+    with closing(env):
+        early, whole = [], []
+        list(play(env, controller, 2, 0, early.append, max_successes=5))
+        list(play(env, controller, 2, 0, whole.append))
+    assert [episode.steps for episode in whole] == [300, 300]
+    for episode in early:
+        assert episode.success
+        assert 5 <= episode.steps < 300
+
+
+REACH = ReachConfig(num_goals=6, max_episode_steps=5)
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory):
+    return draw_spec(robot("arm3"), REACH, cache=tmp_path_factory.mktemp("goals"))
+
+
+def reads_of_a_rollout(spec, agent, discrete, num_steps):
+    """Return what the second rollout of a learner reads, treating the CPU as a GPU."""
+    observe = ObservationConfig(velocity=True, jacobian=True, dls=True, tree=True)
+    kind = "discrete" if discrete else "continuous"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(base, "HOST_DEVICES", ())
+        batch = batch_from_specs([spec], 8, sim="kinematic", kind=kind, observe=observe)
+        student = learner(batch, agent=agent, discrete=discrete, num_steps=num_steps)
+        student._collect_rollout()
+    with device_reads() as reads:
+        metrics = student._collect_rollout()
+    assert metrics["episodes"] > 0
+    assert len(student.final_observations["tokens"]) == metrics["episodes"]
+    return reads.found
+
+
+@pytest.mark.parametrize(
+    ("agent", "discrete"), [("me-mlp", False), ("me-mlp", True), ("me-graph", False)]
+)
+def test_reads_of_a_rollout_do_not_grow_with_its_steps(spec, agent, discrete):
+    few, many = (reads_of_a_rollout(spec, agent, discrete, steps) for steps in (4, 16))
+    assert few == many
+    assert few  # the metrics
+
+
+def test_final_observations_are_the_same_on_every_device(monkeypatch):
+    generator = torch.Generator().manual_seed(0)
+    student = learner()
+    masks = student.truncated = torch.rand(7, 5, generator=generator) < 0.3
+    values = torch.rand(7, 5, 2, generator=generator)
+
+    def gathered():
+        seen = [{"goal": value, "sum": value.sum(dim=1)} for value in values]
+        return student._truncated_rows(list(map(student._rows_to_keep, seen, masks)))
+
+    on_host = gathered()
+    monkeypatch.setattr(base, "HOST_DEVICES", ())
+    elsewhere = gathered()
+    assert torch.equal(on_host["goal"], values[masks])
+    assert all(torch.equal(on_host[name], elsewhere[name]) for name in on_host)
+
+
+def all_resamples(values):
+    """The exact distribution of the mean of resamples."""
+    return [np.mean(chosen) for chosen in product(values, repeat=len(values))]
+
+
+def test_the_interquartile_mean_drops_a_quarter_at_each_end():
+    scores = [[-1000.0, 1.0, 2.0, 3.0], [4.0, 5.0, 6.0, 1000.0]]
+    assert iqm_interval(scores, together=True).value == pytest.approx(np.mean([2, 3, 4, 5]))
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_the_interval_of_one_robot_contains_95_percent_of_the_resamples(together):
+    values = [1.0, 2.0, 4.0]
+    found = iqm_interval(np.array(values)[:, None], together=together)
+    low, high = np.quantile(all_resamples(values), (0.025, 0.975), method="inverted_cdf")
+    assert (found.low, found.high) == pytest.approx((low, high))
+    alone = stratified_mean_interval([values])
+    assert (alone.low, alone.high) == pytest.approx((low, high))
+
+
+def test_resampled_seeds_keep_their_robots_together():
+    # Robots go up and down together: by themselves they make up for each other.
+    scores = np.array([0.0, 1.0, 2.0, 3.0])[:, None] + np.zeros(8)
+    whole, apart = (iqm_interval(scores, together=together) for together in (True, False))
+    assert whole.value == apart.value == pytest.approx(1.5)
+    assert whole.high - whole.low > 2 * (apart.high - apart.low) > 0
+
+
+def test_robots_are_strata_of_the_bootstrap():
+    # Scores differ between robots only: no resample is another.
+    scores = np.tile([1.0, 5.0, 9.0, 100.0], (3, 1))
+    for together in (True, False):
+        found = iqm_interval(scores, together=together)
+        assert (found.value, math.isnan(found.low), math.isnan(found.high)) == (7.0, True, True)
+
+
+def test_the_wilson_interval_stays_within_0_and_1():
+    for successes, low, high in ((0, 0.0, 0.1611), (10, 0.2993, 0.7007), (20, 0.8389, 1.0)):
+        interval = success_interval(successes / 20, 20)
+        assert interval.value == successes / 20
+        assert interval.low == pytest.approx(low, abs=1e-4)
+        assert interval.high == pytest.approx(high, abs=1e-4)
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("trials", [1, 36, [10, 10, 16], [34] * 320, 10**6])
+def test_a_success_rate_always_has_an_interval_with_a_width(rate, trials):
+    rates = np.full(np.shape(trials), rate)
+    interval = success_interval(rates, trials)
+    low, high = interval.as_percent()[:-1].split(" (")[1].split(" to ")
+    assert (interval.low < interval.high, low != high, interval.value) == (True, True, rate)
+
+
+def test_robots_of_equally_many_episodes_are_as_one():
+    assert success_interval([0.25, 0.75], 20) == success_interval(0.5, 40)
+    few, even = success_interval([0.2, 0.4], [5, 35]), success_interval([0.2, 0.4], 20)
+    assert few.high - few.low > even.high - even.low  # the mean is no surer than its worst half
+
+
+@pytest.mark.parametrize("value", [0, 1])
+def test_scores_that_are_successes_have_the_interval_of_successes(value):
+    scores, successes = [[float(value)] * 12] * 3, [[bool(value)] * 12] * 3
+    found = episode_interval(scores, successes, relative=False)
+    assert found == success_interval(value, 36)
+    relative = episode_interval(scores, successes, relative=True)
+    assert (relative.value, math.isnan(relative.low)) == (value, True)
+    mixed = [[0.0, 1.0], [1.0, 1.0]]
+    assert episode_interval(mixed, mixed, relative=False) == success_interval(0.75, 4)
+
+
+@pytest.mark.parametrize(
+    "scores", [[[0.0] * 36], [[5.5] * 3, [5.5] * 3], [[1.0] * 9, [2.0] * 9], [[3.0]]]
+)
+def test_scores_without_a_spread_have_no_interval(scores):
+    for found in (
+        stratified_mean_interval(scores),
+        episode_interval(scores, [[False] * len(each) for each in scores], relative=True),
+        iqm_interval(np.transpose(scores), together=True),
+        iqm_interval(np.array([[1.0] * 15 + [0.9], [1.0] * 15 + [0.8]]), together=True),
+    ):
+        assert isinstance(found, Interval)
+        assert math.isnan(found.low)
+        assert math.isnan(found.high)

@@ -1,7 +1,11 @@
-"""Tables of robots, conversion of actions to joint targets, and rewards of positions and poses."""
+"""Tables of robots, names of robots, actions, rewards, checks of tasks, and speed."""
 
 import math
-from dataclasses import replace
+from contextlib import closing
+from dataclasses import dataclass, replace
+from importlib import import_module
+from itertools import count
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,26 +13,45 @@ import torch
 
 import morphgen
 from helpers.resets import reset_envs
+from helpers.robots import arm
 from helpers.scenes import robot
+from helpers.simulators import PYBULLET
+from helpers.splits import member, split
+from morphgen.encoding.robot_hash import robot_hash
 from morphgen.encoding.tokens import tokens
-from morphgen.errors import BenchmarkError, RobotError, TaskError
+from morphgen.errors import (
+    BenchmarkError,
+    CompositionError,
+    FormatError,
+    PartError,
+    RobotError,
+    TaskError,
+)
 from morphgen.fitting.token_shapes import token_shapes
+from morphgen.formats.fits import has_meshes
+from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar.library import default_library
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.kinematics_torch import matrix_from_quaternion
 from morphgen.model.robot import Frame, Link, Robot
+from morphgen.rl.config import PPOConfig
+from morphgen.rl.runs.checkpoint import config_from
 from morphgen.tasks.actions import ActionDecoder, JointMotion
 from morphgen.tasks.gym.vector import task_vector
 from morphgen.tasks.observation import LinkTokens
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.envs import PushFormulas, curriculum_line, push_terms
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.reach.envs import ReachFormulas, anybody_score, is_near, reach_terms
+from morphgen.tasks.reach.envs import ReachEnvs, ReachFormulas, anybody_score, is_near, reach_terms
+from morphgen.tasks.reach.task import Reach
+from morphgen.tasks.registry import SIMULATORS, TASKS
 from morphgen.tasks.rows import limit_violation, numpy_row, positive_part
-from morphgen.tasks.scenes.make import make_batch
+from morphgen.tasks.scenes.env_specs import load_robot
+from morphgen.tasks.scenes.make import make_batch, make_split_batch, with_geometry
 from morphgen.tasks.scenes.robot_tables import STEP_SLIDE, STEP_TURN, build_robot_tables
-from morphgen.tasks.sim.base import CONTROL_PERIOD
-from morphgen.tasks.task import TaskState
+from morphgen.tasks.sim.base import CONTROL_PERIOD, Scene
+from morphgen.tasks.speed import measure_speed
+from morphgen.tasks.task import GOAL, ObservationField, Task, TaskEnvs, TaskState
 
 CPU = torch.device("cpu")
 
@@ -299,3 +322,364 @@ def test_vectors_report_the_angle(tmp_path):
     assert infos["angle"].shape == (2,)
     assert (infos["angle"] > 0).all()
     vector.close()
+
+
+EXTRA = ObservationField("extra", 1, GOAL.mask)
+
+
+@dataclass(frozen=True)
+class HoverConfig(ReachConfig):
+    task = "hover"
+    num_goals: int = 3
+
+
+class HoverEnvs(ReachEnvs):
+    """Environments of reach with another field."""
+
+    def observe(self, object_pose):
+        return {**super().observe(object_pose), "extra": self.goal[:, :1]}
+
+
+@pytest.fixture
+def make(monkeypatch, tmp_path):
+    """Return a function that makes two environments of a task with changed parts, and steps."""
+    monkeypatch.setattr(TASKS, "_loaded", dict(TASKS._loaded))
+
+    def step(fields=(GOAL, EXTRA), made=None, make_envs=True, sample=Reach.sample, **methods):
+        envs = type("Envs", (HoverEnvs,), methods)
+        kind = type(
+            "Hover",
+            (Reach,),
+            {
+                "name": "hover",
+                "config_type": HoverConfig,
+                "fields": fields,
+                "sample": sample,
+                "make_envs": lambda self, *args: made or (envs(*args) if make_envs else None),
+            },
+        )
+        TASKS.register(kind())
+        batch = make_batch("hover", ["gantry-plane"], 2, sim="kinematic", cache=tmp_path)
+        batch.reset()
+        return batch.step(torch.zeros(batch.action_mask.shape))
+
+    return step
+
+
+def changed(**changes):
+    """Return ``evaluate`` with parts of the result changed by functions of them."""
+
+    def evaluate(self, state):
+        result = HoverEnvs.evaluate(self, state)
+        return replace(result, **{key: new(getattr(result, key)) for key, new in changes.items()})
+
+    return {"evaluate": evaluate}
+
+
+def test_a_sound_task_is_stepped(make):
+    assert make().final_observation["extra"].shape == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"make_envs": None}, "make_envs returned NoneType; expected TaskEnvs"),
+        ({"sample": lambda *_, **__: None}, "sample returned NoneType; expected ReachGoalSet"),
+        ({"begin": lambda *_: torch.zeros(2, 5)}, "begin returned Tensor; expected two tensors"),
+        (
+            {"begin": lambda *_: (torch.zeros(2, 1), torch.zeros(2, 7))},
+            r"begin: the joint positions has shape \(2, 1\); expected \(2, 5\)",
+        ),
+        ({"evaluate": lambda *_: (1, 2)}, "evaluate returned tuple; expected a StepResult"),
+        (changed(terms=lambda terms: {}), "evaluate: no reward terms; expected one or more"),
+        (
+            changed(terms=lambda terms: {"a": next(iter(terms.values())).mean()}),
+            r"evaluate: the reward term 'a' has shape \(\); expected \(2,\)",
+        ),
+        (
+            changed(terms=lambda terms: {"a": next(iter(terms.values()))[:, None]}),
+            r"evaluate: the reward term 'a' has shape \(2, 1\); expected \(2,\)",
+        ),
+        (changed(terms=lambda terms: {"a": 1.0}), "the reward term 'a': float; expected a tensor"),
+        (changed(success=torch.Tensor.float), "success is torch.float32; expected bool"),
+        (changed(distance=torch.Tensor.bool), "distance is torch.bool; expected numbers"),
+        ({"observe": ReachEnvs.observe}, "observe: the field 'extra' is missing"),
+        ({"fields": (GOAL,)}, "observe: 'extra' is no ObservationField in the task's `fields`"),
+        (
+            {"fields": (GOAL, replace(EXTRA, size=2))},
+            r"observe: the field 'extra' has shape \(2, 1\); expected \(2, 2\)",
+        ),
+        ({"fields": (replace(GOAL, size=9), EXTRA)}, "field 'goal': the name is taken"),
+        ({"fields": (GOAL, replace(EXTRA, name="tokens"))}, "field 'tokens': the name is taken"),
+    ],
+)
+def test_faults_are_named(make, parts, message):
+    with pytest.raises(TaskError, match=f"task 'hover': .*{message}"):
+        make(**parts)
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"name": "Hover-Task"}, "'Hover-Task': expected a name of lower-case letters and digits"),
+        ({"name": "float"}, "'float': config_type.task is 'hover'; expected 'float'"),
+        ({"config_type": None}, "'hover': the class attribute 'config_type' is missing"),
+        ({"config_type": int}, "'hover': config_type is .*int.*; expected a TaskConfig"),
+        (
+            {"sample": lambda self, robot, config: None},
+            r"'hover': sample\(robot, config\): got an unexpected keyword argument 'obstacles'",
+        ),
+        (
+            {"make_envs": lambda self: None},
+            r"'hover': make_envs\(\): too many positional arguments",
+        ),
+    ],
+)
+def test_an_incomplete_task_is_not_registered(monkeypatch, parts, message):
+    monkeypatch.setattr(TASKS, "_loaded", dict(TASKS._loaded))
+    described = {name: getattr(Reach, name) for name in ("goal_set_type", "goal_format", "fields")}
+    methods = {name: getattr(Reach, name) for name in ("sample", "certify", "make_envs")}
+    whole = {"name": "hover", "config_type": HoverConfig, "cache_folder": "hover", **described}
+    parts = {name: part for name, part in {**whole, **methods, **parts}.items() if part}
+    with pytest.raises(TaskError, match=f"task {message}"):
+        TASKS.register(type("Hover", (Task,), parts)())
+    assert parts["name"] not in TASKS
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({}, "Bare has no evaluate and no observe; expected these methods, or `formulas`"),
+        ({"evaluate": print}, "Bare has no observe; expected this method, or"),
+        ({"observe": print}, "Bare has no evaluate; expected this method, or"),
+        ({"formulas": None}, "Bare has no evaluate and no observe"),
+    ],
+)
+def test_environments_without_formulas_need_methods(make, parts, message):
+    bare = type("Bare", (TaskEnvs,), {"begin": HoverEnvs.begin, **parts})
+    with pytest.raises(TaskError, match=f"task 'hover': {message}"):
+        make(made=bare())
+
+
+def test_a_run_of_an_unknown_task_is_named():
+    data = {"source": {}, "policy": {}, "ppo": vars(PPOConfig()), "hover": {"near": 0.1}}
+    with pytest.raises(TaskError, match="run: unknown task 'hover'; run the script that registers"):
+        config_from(data)
+
+
+WORDS_ONE_ROBOT = "arm=ur5 ee=stick"
+CONFIG = ReachConfig(num_goals=4)
+STEPS = 40
+NAMES = ("words", "bundle", "urdf", "robot", "read", "primitives", "bundle of primitives", "member")
+
+
+@pytest.fixture(scope="module")
+def named(tmp_path_factory):
+    """The robot under every name except that of a split member."""
+    folder = tmp_path_factory.mktemp("robots")
+    robot = morphgen.compose(WORDS_ONE_ROBOT)
+    primitives = morphgen.compose(WORDS_ONE_ROBOT, name="primitives", geometry="primitive")
+    bundle = morphgen.write(robot, folder, picture=False)
+    other = morphgen.write(primitives, folder, picture=False)
+    return {
+        "words": WORDS_ONE_ROBOT,
+        "bundle": bundle,
+        "urdf": str(bundle / "robot.urdf"),
+        "robot": robot,
+        "read": morphgen.read(bundle),
+        "primitives": primitives,
+        "bundle of primitives": other,
+    }
+
+
+@pytest.fixture(scope="module")
+def batches(named, tmp_path_factory):
+    """One environment per name, with freshly sampled goals."""
+
+    def options(name):
+        cache = tmp_path_factory.mktemp(name.replace(" ", "-"))
+        return {"sim": "mujoco", "seed": 0, "configs": (CONFIG,), "cache": cache}
+
+    made = {
+        name: make_batch("reach", [robot], 1, obstacles=True, **options(name))
+        for name, robot in named.items()
+    }
+    one = split(
+        [member(WORDS_ONE_ROBOT, task="reach", obstacles=True)], [member("prims", task="reach")]
+    )
+    made["member"] = make_split_batch(one, "train", 1, **options("member"))
+    yield made
+    for batch in made.values():
+        batch.close()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_shapes_goals_and_scores_are_the_same(batches, name):
+    reference, other = (batches[each].specs[0].robot for each in ("words", name))
+    assert [link.collisions for link in other.links] == [
+        link.collisions for link in reference.links
+    ]
+    assert other.joints == reference.joints
+    assert other.home == reference.home
+    assert other.ignore_pairs == reference.ignore_pairs
+    assert robot_hash(other, visuals=False) == robot_hash(reference, visuals=False)
+    assert (batches[name].robot_tables.tokens == batches["words"].robot_tables.tokens).all()
+    reference, other = (batches[each].specs[0].goals for each in ("words", name))
+    assert (other.key, other.tried) == (reference.key, reference.tried)
+    assert other.obstacles == reference.obstacles
+    np.testing.assert_array_equal(other.q, reference.q)
+    np.testing.assert_array_equal(other.poses, reference.poses)
+    rewards, expected = (rewards_of(batches[each]) for each in (name, "words"))
+    assert rewards == expected
+    assert len(set(rewards)) > STEPS / 2
+
+
+def rewards_of(batch):
+    """Return the rewards of all steps, for the same actions."""
+    rng = np.random.default_rng(0)
+    batch.reset(0)
+    actions = [batch.action_mask * float(rng.uniform(-1, 1)) for _ in range(STEPS)]
+    return [float(batch.step(action).reward[0]) for action in actions]
+
+
+def test_visuals_do_not_change_the_simulation_hash():
+    robot = load_robot("arm=ur5 ee=stick")
+    bare = robot.with_links([replace(link, visuals=()) for link in robot.links])
+    assert robot_hash(bare, visuals=False) == robot_hash(robot, visuals=False)
+    assert robot_hash(bare) != robot_hash(robot)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("gantry-cube", "base=gantry ee=cube"),
+        ("pedestal-arm3-stick", "base=pedestal arm=arm3 ee=stick"),
+        ("chain beads=4", "chain beads=4"),
+        ("arm=arm3 ee=stick ee.length=0.3", "arm=arm3 ee=stick ee.length=0.3"),
+    ],
+)
+def test_names_are_compose_arguments(given, words):
+    expected = morphgen.compose(words, geometry="primitive")
+    assert load_robot(given).name == expected.name
+    assert robot_hash(load_robot(given)) == robot_hash(expected)
+
+
+def test_collision_shapes_are_primitives_by_default():
+    for given, expected in (({}, False), ({"geometry": "mesh"}, True)):
+        links = load_robot("ur5-plane", **given).links
+        assert any(has_meshes(link.collisions) for link in links) is expected
+
+
+def test_robot_files_are_read(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = morphgen.write(arm(), "bundles", picture=False)
+    Path("own.urdf").write_text(urdf_text(arm(), str))
+    for given in (folder, str(folder), "bundles/arm", "own.urdf", Path("own.urdf")):
+        assert load_robot(given).dof == arm().dof
+        assert load_robot(given).frame("tool")
+    Path("lr=3").mkdir()
+    Path("own.urdf").rename("lr=3/own.urdf")
+    assert load_robot("lr=3/own.urdf").dof == arm().dof
+
+
+def test_folder_that_is_not_a_bundle_does_not_hide_a_grammar(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("prims").mkdir()
+    assert load_robot("prims").name == "prims"
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "says"),
+    [
+        ("ur5-plain", CompositionError, "'plain' is not a part; did you mean 'plane'?"),
+        ("chian beads=4", CompositionError, "did you mean 'chain'?"),
+        ("bead", CompositionError, "'bead' is a segment, which only a grammar can use"),
+        ("ur5-ur10", CompositionError, "arm is given twice: ur5 and ur10"),
+        ("arm=ur5 ee=plain", PartError, "did you mean 'plane'?"),
+        ("robots/missing", FormatError, "robots/missing: no such file"),
+        (Path("missing"), FormatError, "missing: no such file"),
+        (" ", CompositionError, "no robot is named"),
+    ],
+)
+def test_unknown_name_suggests_the_nearest(given, error, says):
+    with pytest.raises(error) as caught:
+        load_robot(given)
+    assert says in str(caught.value)
+
+
+PANDA = "arm=panda ee=panda_hand"
+
+
+def test_unknown_and_unused_geometries_are_refused():
+    with pytest.raises(TaskError, match="geometry 'hull'; valid: convex, primitive"):
+        make_batch("reach", ["arm3"], 1, sim="mujoco", geometry="hull")
+    with pytest.raises(TaskError, match="'convex': simulator 'kinematic' has no contacts"):
+        make_batch("reach", ["arm3"], 1, sim="kinematic", geometry="convex")
+
+
+def test_convex_robots_collide_as_their_meshes():
+    batches = [
+        make_batch("push", [PANDA], 2, sim="mujoco", geometry=geometry, seed=4)
+        for geometry in ("primitive", "convex")
+    ]
+    first, other = (batch.reset() for batch in batches)
+    assert all(torch.equal(first[name], other[name]) for name in first)
+    simulated = batches[1].simulation.scenes[0].robot
+    assert batches[1].specs[0].robot.links == batches[0].specs[0].robot.links != simulated.links
+    meshed = [link for link in simulated.links if has_meshes(link.collisions)]
+    assert len(meshed) == 9  # the Panda's meshes are convex, so each is its own piece
+    assert simulated.joints == batches[0].specs[0].robot.joints
+
+
+def test_convex_pieces_need_the_meshes():
+    composed = robot(PANDA)
+    stranger = replace(composed, provenance={})
+    with pytest.raises(TaskError, match="'convex' needs its meshes"):
+        with_geometry([Scene(stranger)], "convex")
+    changed = replace(composed.joints[0], name="renamed")
+    with pytest.raises(TaskError, match="'convex' needs its meshes"):
+        with_geometry(
+            [Scene(replace(composed, joints=(changed, *composed.joints[1:])))],
+            "convex",
+            default_library().folders,
+        )
+    simple = robot("prims")
+    assert with_geometry([Scene(simple)], "convex")[0].robot is simple
+
+
+CONFIG_SPEED = replace(ReachConfig(), num_goals=4, max_episode_steps=10)
+
+
+@pytest.fixture(scope="module")
+def robot_speed():
+    return morphgen.compose("arm=arm3 ee=claw")
+
+
+@pytest.mark.parametrize("sim", [PYBULLET, "mujoco"])
+def test_shares_sum_to_one_and_separate_the_native_step(robot_speed, sim, tmp_path):
+    ticks, (module, step) = count(), SIMULATORS[sim].native_step
+    with closing(
+        make_batch("reach", [robot_speed], 3, sim=sim, configs=(CONFIG_SPEED,), cache=tmp_path)
+    ) as batch:
+        report = measure_speed(
+            batch, 2000, own=[(import_module(module), step)], clock=lambda: float(next(ticks))
+        )
+        assert "step" not in vars(batch.simulation)
+        assert "observe" not in vars(batch)
+    assert sum(report.shares.values()) == pytest.approx(1)
+    for part in ("simulator", "around the simulator", "observation", "rewards", "new episodes"):
+        assert report.shares[part] > 0, part
+    # A step reads the clock twice per part, and again per environment in the simulator.
+    assert report.shares["simulator"] == pytest.approx(3 * report.shares["actions"], rel=0.05)
+    assert report.substeps_per_second == 4 * report.steps_per_second > 0
+
+
+def test_simulator_time_is_one_share_without_the_native_step(robot_speed, tmp_path):
+    ticks = count()
+    with closing(
+        make_batch("reach", [robot_speed], 2, sim="mujoco", configs=(CONFIG_SPEED,), cache=tmp_path)
+    ) as batch:
+        report = measure_speed(batch, 507, clock=lambda: float(next(ticks)))
+        assert batch.episode_step.tolist() == [0, 0]  # whole episodes
+    assert "around the simulator" not in report.shares
+    assert report.shares["simulator"] == pytest.approx(report.shares["actions"], rel=0.05)

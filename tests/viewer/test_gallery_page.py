@@ -1,17 +1,53 @@
-"""The gallery pages: cards, the filter and its values in the address, histograms, new splits."""
+"""Galleries and populations of robots, comparisons, and splits."""
 
 import os
 import re
+import shutil
 import signal
 
+import numpy as np
 import pytest
 
-from helpers.pages import field, press
+from helpers.pages import field, nodes, pointer, press
+from helpers.robots import arm
 from helpers.viser_client import PlainClient
-from morphgen.splits.split_file import read_split
-from morphgen.viewer.app.address import AddressError
-from morphgen.viewer.figures import histogram_svg
+from morphgen.errors import BenchmarkError
+from morphgen.grammar.compose import compose
+from morphgen.grammar.library import default_library
+from morphgen.grammar.request import parse_words
+from morphgen.model.geometry import Capsule, Shape
+from morphgen.model.kinematics import forward_kinematics, joint_limits
+from morphgen.model.robot import Link, Robot
+from morphgen.splits.split_file import find_split, read_split
+from morphgen.viewer import population as population_arrays
+from morphgen.viewer.app.address import AddressError, parse_address
+from morphgen.viewer.comparison import (
+    all_roles,
+    compare_robots,
+    joint_roles,
+    normalized_positions,
+    similarity_table,
+    with_roles,
+)
+from morphgen.viewer.figures import heatmap_svg, histogram_svg, map_svg
 from morphgen.viewer.gallery import parse_range
+from morphgen.viewer.pages import population as population_page
+from morphgen.viewer.pages.gallery import choose_sides
+from morphgen.viewer.pages.population import format_selection, parse_selection, selection_text
+from morphgen.viewer.population import (
+    ReadRobot,
+    arrange,
+    find_source,
+    make_population,
+    move_roles,
+    read_robots,
+    shape_poses,
+)
+from morphgen.viewer.robot_rows import Row
+from morphgen.viewer.robot_uri import FileAccess, UriError, read_robot_uri
+from morphgen.viewer.scene.robot import robot_bounds
+from morphgen.viewer.scene.stage import View, fit_camera, project_points
+from morphgen.viewer.splits import make_member, save_split
 
 
 def test_cards_of_a_gallery_lead_to_their_robots(shared_viewer):
@@ -190,3 +226,374 @@ def test_a_gallery_shows_the_distributions_of_its_facts(shared_viewer):
     with PlainClient(shared_viewer.port, "?gallery=robots/prims") as client:
         client.control("MultiSlider", "Reach (m)")
         client.shows("robots from")
+
+
+@pytest.fixture
+def population(folder, files):
+    uris = [f"robots/prims/prims-{i:06d}" for i in range(6)] + ["robots/some-arm"]
+    read = []
+    for i, uri in enumerate(uris):
+        robot = read_robot_uri(uri, files)
+        read.append(ReadRobot(Row(uri, uri, order=i), robot, np.array(robot_bounds(robot))))
+    return make_population(read)
+
+
+def test_poses_of_all_robots_equal_those_of_each(population):
+    rng = np.random.default_rng(0)
+    q = rng.uniform(population.lower, population.upper)
+    poses, instances = shape_poses(population, q), population.instances
+    for i, robot in enumerate(population.robots):
+        T_root_link = forward_kinematics(robot, q[i, : robot.dof])
+        mine = instances.robot == i
+        expected = T_root_link[instances.link[mine]] @ instances.T_link_shape[mine]
+        np.testing.assert_allclose(poses[mine], expected, atol=1e-5)
+
+
+def test_a_capsule_is_a_cylinder_and_two_balls():
+    robot = Robot("pill", (Link("root", visuals=(Shape(Capsule(0.1, 0.4)),)),))
+    pill = make_population([ReadRobot(Row("pill", "pill"), robot, np.zeros((2, 3)))])
+    assert len(pill.instances.robot) == 3
+    heights = sorted(shape_poses(pill, pill.home)[:, 2, 3])
+    np.testing.assert_allclose(heights, (-0.2, 0.0, 0.2), atol=1e-6)
+
+
+def test_a_role_moves_in_every_robot_by_the_same_share(population):
+    q = move_roles(population, population.home, {"joint 1": 1.0, "joint 2": 0.25})
+    for i, robot in enumerate(population.robots):
+        expected = with_roles(robot, np.array(robot.home), {"joint 1": 1.0, "joint 2": -0.5})
+        np.testing.assert_allclose(q[i, : robot.dof], expected)
+    np.testing.assert_array_equal(move_roles(population, population.home, {}), population.home)
+
+
+def plain(sizes, reaches):
+    """Return a population of robots without shapes that take boxes (n, 3) [m] on the ground."""
+    read = []
+    for i, (size, reach) in enumerate(zip(sizes, reaches, strict=True)):
+        bounds = np.array([np.zeros(3), size])
+        read.append(ReadRobot(Row(f"{i}", f"{i}", reach=reach, order=i), arm(), bounds))
+    return make_population(read)
+
+
+def test_rows_are_sorted_and_labelled_by_their_first_robot():
+    positions, labels = arrange(plain(np.ones((4, 3)), (3, 1, None, 2)), "reach")
+    assert np.lexsort((positions[:, 0], -positions[:, 1])).tolist() == [1, 3, 0, 2]
+    assert [text for text, _ in labels] == ["1 m", "3 m"]
+
+
+def test_robots_in_rows_take_their_own_width_so_that_a_large_one_does_not_spread_the_others():
+    size = np.tile([0.3, 0.1, 0.2], (300, 1))
+    size[::50] = [3.0, 0.1, 0.2]
+    places, labels = arrange(plain(size, [None] * len(size)))
+    assert labels == []
+    left, right = places[:, 0], places[:, 0] + size[:, 0]
+    for y in np.unique(places[:, 1]):
+        row = places[:, 1] == y
+        assert (left[row][1:] > right[row][:-1]).all()
+    assert np.ptp(left) * np.ptp(places[:, 1]) < 1.6 * (size[:, 0] * 0.15).sum()
+
+
+def test_a_camera_has_all_points_in_its_picture_and_touches_the_strictest_sides():
+    points = np.random.default_rng(0).normal(size=(100, 3))
+    tangents = np.array([0.5, 0.3])
+    camera = fit_camera(points, tangents)
+    offset = points - camera
+    share = offset[:, :2] / (tangents * offset[:, 2:])
+    assert np.abs(share).max() == pytest.approx(1)
+    low, high = share.min(axis=0), share.max(axis=0)
+    strictest = int(np.argmax(high - low))
+    assert (low[strictest], high[strictest]) == pytest.approx((-1, 1))
+
+
+def looking_down(height=5.0):
+    """A camera above the origin: right is x, up is y."""
+    axes = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
+    return View(np.array([0.0, 0.0, height]), axes, 1.0, 1.5)
+
+
+def test_points_are_projected_to_the_picture():
+    points, depth = project_points(looking_down(), np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]))
+    np.testing.assert_allclose(points[0], (0.75, 0.5))
+    assert points[1, 0] > 0.75
+    assert points[2, 1] < 0.5
+    np.testing.assert_allclose(depth, 5)
+
+
+def test_selections_survive_the_address():
+    selected = np.array([True, True, True, False, False, True, False])
+    assert format_selection(selected) == "0-2,5"
+    np.testing.assert_array_equal(parse_selection("0-2,5", 7), selected)
+    assert not parse_selection("", 7).any()
+    assert parse_selection("5-99,x,3-", 7).tolist() == [False] * 5 + [True] * 2
+    assert format_selection(np.zeros(3, bool)) == ""
+
+
+def test_the_text_of_a_selection_has_links_facts_and_ranges():
+    one = Row("<img>", "x", reach=0.5, mass=2.0, dof=3, findings=("axis",))
+    text = selection_text([one])
+    assert '<a href="?robot=x">&lt;img&gt;</a> 3 DoF · 0.50 m · 2 kg axis' in text
+    many = selection_text([one, Row("b", "y", reach=0.7)] + 5 * [one])
+    assert "7 selected" in many
+    assert "reach 0.5 to 0.7 m" in many
+    assert "..." in many
+
+
+def test_folders_splits_sides_and_grammars_are_populations(files):
+    assert len(find_source("robots/prims", files, 0, 0).rows) == 30
+    split = "extrapolation/primitives/reach"
+    assert len(find_source(split, files, 0, 0).rows) == 12
+    assert len(find_source(f"{split}@test", files, 0, 0).rows) == 2
+    source = find_source("prims", files, 3, 4)
+    results = read_robots(source.rows, files, "prims", 3)
+    assert [result.row.name for result in results] == [f"prims-{i:06d}" for i in range(4)]
+    for result in results:
+        assert read_robot_uri(result.row.uri, files).dof == result.row.dof == result.robot.dof
+
+
+@pytest.mark.parametrize(
+    ("subject", "message"),
+    [
+        ("../..", "outside"),
+        ("nowhere", "no such file"),
+        ("robots/prims@train", "only a split has sides"),
+        ("extrapolation/primitives/reach@both", "unknown side 'both'"),
+    ],
+)
+def test_what_is_not_a_population_is_named(files, subject, message):
+    with pytest.raises(UriError, match=message):
+        find_source(subject, files, 0, 0)
+
+
+def test_broken_robots_are_reported_with_their_reason(files):
+    rows = find_source("robots", files, 0, 0).rows
+    results = read_robots(rows, files)
+    read = {result.row.name: result for result in results if isinstance(result, ReadRobot)}
+    ((name, error),) = [result for result in results if not isinstance(result, ReadRobot)]
+    assert name == "broken"
+    assert "lost" in error
+    assert read["some-arm"].row.reach is not None
+
+
+def test_the_key_of_a_population_changes_with_its_files(folder, tmp_path):
+    shutil.copytree(folder / "robots" / "some-arm", tmp_path / "some-arm")
+    files = FileAccess((), (tmp_path,), tmp_path / "none")
+    before = find_source(".", files, 0, 0).key
+    assert find_source(".", files, 0, 0).key == before
+    urdf = tmp_path / "some-arm" / "robot.urdf"
+    urdf.write_text(urdf.read_text() + "\n")
+    assert find_source(".", files, 0, 0).key != before
+
+
+@pytest.mark.slow
+def test_a_large_population_says_that_it_has_no_shadows(shared_viewer, monkeypatch):
+    for module in (population_arrays, population_page):
+        monkeypatch.setattr(module, "MAX_SHADOWS", 10)
+    with PlainClient(shared_viewer.port, "?population=robots/prims") as client:
+        client.shows("without shadows: more than 10 robots")
+        batches = [m for m in client.messages if m["type"] == "BatchedMeshesMessage"]
+        assert batches
+        assert not any(message["props"]["cast_shadow"] for message in batches)
+
+
+def test_clicks_rectangles_and_buttons_select_robots(viewer):
+    on = viewer()
+    query = "?population=robots/prims&arrange=reach&joint1=0.25&select=2,4-5"
+    with PlainClient(on.port, query) as client:
+        client.shows("3 selected")
+        client.until(lambda: client.addresses[-1] == (0, query))
+        batches = client.until(
+            lambda: [m for m in client.messages if m["type"] == "BatchedMeshesMessage"]
+        )
+        click = pointer("Click", batches[0], instance_index=0)
+        for index in (-1, 10**6, None):
+            client.send({**click, "instance_index": index})
+        client.send(click)
+        client.shows("1 selected")
+        client.shows("joint1=0.25&select=0")
+        last = len(nodes(on)[batches[0]["name"]].batched_positions) - 1
+        client.send({**click, "instance_index": last, "modifier": "shift"})
+        client.shows("2 selected")
+        client.change(client.control("ButtonGroup", "Select"), "invert")
+        client.shows("28 selected")
+        client.change(client.control("Button", "Choose"))
+        client.shows("28 chosen")
+        client.change(client.control("Button", "Home"))
+        client.until(lambda: "joint1" not in client.addresses[-1][1])
+        whole = {"event_type": "rect-select", "screen_pos": [[-99.0, -99.0], [99.0, 99.0]]}
+        rays = {"modifier": "shift", "ray_origin": None, "ray_direction": None}
+        client.send({"type": "ScenePointerMessage", **whole, **rays})
+        client.shows("30 selected")
+        client.change(client.control("ButtonGroup", "Select"), "none")
+        client.until(lambda: "select" not in client.addresses[-1][1])
+        client.change(client.control("Button", "Choose"))
+        client.shows("no robot is selected: drag a rectangle")
+
+
+@pytest.mark.slow
+def test_the_page_is_covered_until_its_content_is_there(see, picture):
+    page = see("?population=robots/prims")
+    assert page.locator("#morphgen-cover").count() == 1
+    page.locator("#morphgen-cover").wait_for(state="detached")
+    page.get_by_text("no robot is selected").wait_for()
+    picture(page, "population")
+    assert page.failures == []
+
+
+LIBRARY = default_library()
+
+
+def robot_of(words):
+    derivation, name = parse_words(words.split(), LIBRARY)
+    return compose(derivation, LIBRARY, name)
+
+
+def test_joint_roles_count_joints_on_the_path_to_the_tool():
+    assert joint_roles(arm()) == ["joint 1", "joint 2", "joint 3", "finger 1"]
+    panda = robot_of("arm=panda ee=panda_hand")
+    assert joint_roles(panda) == [f"joint {i}" for i in range(1, 8)] + ["finger 1"]
+    assert all_roles([arm(), panda]) == [f"joint {i}" for i in range(1, 8)] + ["finger 1"]
+
+
+def test_joint_role_moves_every_robot_by_the_same_fraction():
+    for robot in (arm(), robot_of("arm=panda ee=panda_hand")):
+        home = np.array(robot.home)
+        assert with_roles(robot, home, {}) == pytest.approx(home)
+        moved = with_roles(robot, home, {"joint 2": -1.0, "finger 1": 1.0, "joint 99": 1.0})
+        rows = {role: i for i, role in enumerate(joint_roles(robot))}
+        low, high = joint_limits(robot).T
+        assert moved[rows["joint 2"]] == pytest.approx(low[rows["joint 2"]])
+        assert moved[rows["finger 1"]] == pytest.approx(high[rows["finger 1"]])
+        values = dict(zip(joint_roles(robot), normalized_positions(robot, home), strict=True))
+        assert with_roles(robot, home, values) == pytest.approx(home)
+
+
+def test_robot_compared_with_itself_is_identical():
+    robots = [robot_of("base=planar ee=cube"), robot_of("base=gantry ee=plane")]
+    similarity = compare_robots(robots, LIBRARY.folders)
+    assert similarity["cosine"].diagonal() == pytest.approx([1, 1])
+    assert similarity["tree"].diagonal() == pytest.approx([0, 0])
+    assert similarity["tree"][0, 1] > 0
+    table = similarity_table(["<a>", "b"], similarity)
+    assert "&lt;a&gt; and b" in table
+
+
+def test_positions_of_roles_are_clipped_or_left_out_and_shown_in_the_address(viewer):
+    on = viewer()
+    query = "?compare=robots/some-arm&joint1=-3&joint2=x&joint3=nan&lost=1"
+    with PlainClient(on.port, query) as client:
+        client.shows("compare=robots/some-arm&joint1=-1")
+        before = nodes(on)["/robot0/2"].position.copy()
+        client.change(client.control("Slider", "joint 2"), 0.5)
+        client.shows("joint1=-1&joint2=0.5")
+        rotated = nodes(on)["/robot0/2"]
+        assert not np.allclose(rotated.position, before) or not np.allclose(
+            rotated.wxyz, [1, 0, 0, 0]
+        )
+        client.change(client.control("ButtonGroup", "Go to"), "middle")
+        client.shows("joint1=0&joint2=0&joint3=0&finger1=0")
+        client.change(client.control("ButtonGroup", "Go to"), "home")
+        shown = (0, "?compare=robots/some-arm")
+        client.until(lambda: client.addresses[-1] == shown)
+
+
+def test_figures_link_to_robots_and_escape_names():
+    names, sides = ["<a>", "b"], ["train", "test"]
+    text = map_svg(np.array([[0.0, 0.0], [1.0, 0.5]]), names, sides, ["x y", "z"], {"z": "data:,"})
+    assert text.count("<image") == 1
+    assert 'href="?robot=x%20y"' in text
+    assert "&lt;a&gt;" in text
+    assert "<a>" not in text.replace("<a href", "")
+    heatmap = heatmap_svg(np.array([[1.0, 0.3], [0.3, 1.0]]), names, sides, larger=True)
+    assert heatmap.count("<rect") == 4
+    assert "b and &lt;a&gt;: 0.300" in heatmap
+
+
+@pytest.mark.parametrize(
+    "points", [np.random.default_rng(0).normal(size=(60, 2)), np.zeros((60, 2))]
+)
+def test_pictures_of_a_map_do_not_cover_each_other(points):
+    names = [str(i) for i in range(60)]
+    text = map_svg(points, names, ["test"] * 60, names, {})
+    pattern = r'class="point" x="([\d.]+)" y="([\d.]+)" width="([\d.]+)" height="([\d.]+)"'
+    boxes = np.array(re.findall(pattern, text), dtype=float)
+    low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
+    overlap = np.minimum(high[:, None], high) - np.maximum(low[:, None], low)
+    shared = np.maximum(overlap, 0).prod(axis=2)[~np.eye(60, dtype=bool)]
+    assert len(boxes) == 60
+    assert shared.max() == 0
+    assert np.ptp(low, axis=0).min() > 2 * boxes[0, 2]  # they fill the map
+
+
+SPLIT = "extrapolation/primitives/reach"
+
+
+@pytest.mark.slow
+def test_split_page_shows_both_sides_the_map_and_the_audit(see, picture):
+    page = see(f"?split={SPLIT}")
+    page.get_by_text("train (10)").wait_for()
+    page.get_by_text("test (2)").wait_for()
+    page.wait_for_selector(".card:has-text('chain-000001') img")
+    picture(page, "split")
+    at_work = page.get_by_role("link", name="see robots to test on at work").get_attribute("href")
+    assert parse_address(at_work).subjects == ("reach",)
+    assert [robot.rpartition("/")[2] for robot in parse_address(at_work).robots] == [
+        member.name for member in read_split(find_split(SPLIT)).test
+    ]
+    page.get_by_role("tab", name="Statistics").click()
+    page.get_by_text("Cosine of test to train").wait_for()
+    page.get_by_role("tab", name="Audit").click()
+    page.get_by_text("Nearest train robots").wait_for()
+    page.get_by_role("tab", name="Similarity").click()
+    page.locator("svg rect:has(> title)").first.wait_for()
+    assert page.locator("svg rect:has(> title)").count() == 144
+    page.get_by_role("tab", name="Map").click()
+    point = page.locator("svg a", has=page.locator("title", has_text="chain-000001"))
+    point.first.wait_for()
+    page.locator("svg image").nth(11).wait_for()
+    picture(page, "split-map")
+    point.first.locator("image").click()
+    page.wait_for_url(re.compile(r"robot=split:.*chain-000001"))
+    page.get_by_text("chain-000001").first.wait_for()
+    assert page.failures == []
+
+
+@pytest.mark.slow
+def test_new_split_is_saved_from_the_shown_robots(see, folder):
+    page = see(f"?split={SPLIT}&search=0000")
+    page.get_by_text("train (10)").wait_for()
+    field(page, "Search").fill("000001")
+    page.get_by_text(re.compile("of 12 robots")).wait_for()
+    page.get_by_text("New split of what is shown").click()
+    field(page, "split name").fill("mine/ones")
+    press(page, "Save")
+    page.get_by_text("morphgen split audit splits/mine/ones.yaml").wait_for()
+    split = read_split(folder / "splits" / "mine" / "ones.yaml")
+    assert {member.name[-6:] for member in (*split.train, *split.test)} == {"000001"}
+    press(page, "Save")
+    page.get_by_text(re.compile("exists; choose another name")).first.wait_for()
+
+
+def test_robots_of_a_set_become_members(folder, files, monkeypatch):
+    monkeypatch.chdir(folder)
+    members = [
+        make_member(f"robots/prims/prims-{i:06d}", "prims", "push", False, files) for i in range(4)
+    ]
+    path = save_split("mine/prims", "interpolation", members[:3], members[3:], files)
+    split = read_split(path)
+    assert split.train == tuple(members[:3])
+    assert {member.task for member in split.train} == {"push"}
+
+
+def test_filter_separates_train_and_test_robots():
+    rows = [Row(name, name) for name in "abcdef"]
+    train, test = choose_sides(rows, rows[2:5], 2, 3)
+    assert [row.name for row in train] == ["c", "d"]
+    assert [row.name for row in test] == ["a", "b", "f"]
+    with pytest.raises(BenchmarkError, match="3 robots pass the filter and 3 do not: too few"):
+        choose_sides(rows, rows[2:5], 4, 1)
+
+
+def test_empty_sides_and_invalid_names_are_rejected(files):
+    with pytest.raises(BenchmarkError, match="0 train and 0 test"):
+        save_split("mine", "interpolation", [], [], files)
+    with pytest.raises(BenchmarkError, match="use letters"):
+        save_split("../mine", "interpolation", [], [], files)

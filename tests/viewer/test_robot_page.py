@@ -1,4 +1,4 @@
-"""The robot page in a browser."""
+"""The page of a robot: rows, tables, overlays, edits."""
 
 import gc
 import io
@@ -8,16 +8,54 @@ import signal
 import subprocess
 import weakref
 import zipfile
+from dataclasses import replace
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from PIL import Image
 
-from helpers.pages import choose, field, nodes, press, wait_until
+from helpers.pages import choose, field, nodes, pointer, press, wait_until
+from helpers.pages import nodes as scene_nodes
+from helpers.robots import arm, finger
+from helpers.viser_client import PlainClient
 from morphgen.checks.self_collision import SelfCollisionChecker
-from morphgen.model.kinematics import frame_pose
-from morphgen.viewer.pages.robot import format_joints
+from morphgen.formats.bundle import write_bundle
+from morphgen.grammar.library import default_library
+from morphgen.model.findings import Finding
+from morphgen.model.kinematics import forward_kinematics, frame_pose
+from morphgen.model.robot import Inertial
+from morphgen.model.rotation import to_matrix
+from morphgen.viewer.pages.robot import (
+    format_joints,
+    joint_of_link,
+    parse_joints,
+    turn_towards,
+)
+from morphgen.viewer.robot_rows import (
+    Row,
+    fact_choices,
+    facts_line,
+    part_rows,
+    passes,
+    select_page,
+    sort_rows,
+)
+from morphgen.viewer.robot_tables import (
+    is_about,
+    joint_groups,
+    joint_hint,
+    licence_line,
+    link_card,
+    link_table,
+    slider_step,
+    summary,
+)
 from morphgen.viewer.robot_uri import read_robot_uri
+from morphgen.viewer.scene import overlays as workspace
+from morphgen.viewer.scene.overlays import range_lines
 from morphgen.viewer.scene.robot import RED
+from morphgen.viewer.scene.stage import View, add_scale_bar, inertia_box, look_at, project_points
 
 ARM = "?robot=robots/some-arm"
 
@@ -134,3 +172,434 @@ def test_an_upload_is_shown(see, tmp_path):
     chooser.value.set_files(tmp_path / "some.xml")
     page.wait_for_url(re.compile(r"robot=upload:"))
     page.get_by_text("sent").first.wait_for()
+
+
+ROWS = [
+    Row("b-arm", "b", "arms", "train", dof=6, reach=0.9, mass=20.0, findings=(), order=0),
+    Row("a-hand", "a", "hands", "test", dof=2, reach=None, mass=1.0, findings=("axis",), order=1),
+    Row("c-arm", "c", "arms", "test", dof=7, reach=1.2, mass=None, findings=None, order=2),
+]
+
+
+def names(rows):
+    return [row.name[0] for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("condition", "left"),
+    [
+        ({}, "bac"),
+        ({"search": "ARM", "sort": "name"}, "bc"),
+        ({"search": "arm train"}, "b"),
+        ({"search": "axis", "category": ""}, "a"),
+        ({"category": "hands"}, "a"),
+        ({"role": "test"}, "ac"),
+        ({"findings": "with"}, "a"),
+        ({"findings": "without"}, "bc"),
+        ({"dof": "3..6"}, "b"),
+        ({"reach": "0.5..2"}, "bc"),
+        ({"mass": "0..100"}, "ba"),
+        ({"search": "arm", "role": "test", "dof": "7..7"}, "c"),
+    ],
+)
+def test_filters(condition, left):
+    assert names(row for row in ROWS if passes(row, condition)) == list(left)
+
+
+@pytest.mark.parametrize(
+    ("key", "order"),
+    [
+        ("order", "bac"),
+        ("-order", "cab"),
+        ("name", "abc"),
+        ("-name", "cba"),
+        ("reach", "bca"),
+        ("-reach", "cba"),
+        ("mass", "abc"),
+        ("-mass", "bac"),
+        ("-findings", "abc"),
+    ],
+)
+def test_sorting_puts_unknown_values_last(key, order):
+    assert names(sort_rows(ROWS, key)) == list(order)
+
+
+@pytest.mark.parametrize(
+    ("number", "size", "expected"),
+    [
+        (1, 3, ([0, 1, 2], 1, 3)),
+        (3, 3, ([6], 3, 3)),
+        (9, 3, ([6], 3, 3)),
+        (0, 3, ([0, 1, 2], 1, 3)),
+        (1, 7, ([0, 1, 2, 3, 4, 5, 6], 1, 1)),
+    ],
+)
+def test_pages(number, size, expected):
+    assert select_page(range(7), number, size) == expected
+
+
+def test_parts_have_their_stored_facts_before_they_are_drawn():
+    rows = part_rows(default_library())
+    facts = [(row.dof, row.reach, row.mass, row.licence) for row in rows]
+    assert all(None not in each and each[-1] for each in facts)
+    wide = [row.name for row in sort_rows(rows, "-reach")]
+    assert wide.index("ur10") < wide.index("ur5") < wide.index("plane")
+    assert all(1 <= row.reach <= 2 for row in rows if passes(row, {"reach": "1..2"}))
+    assert passes(next(row for row in rows if row.name == "ur10"), {"reach": "1..2"})
+
+
+def test_a_robot_passes_with_each_of_its_licences():
+    row = Row("d", "d", licence="MIT, Apache-2.0")
+    assert fact_choices([row, Row("e", "e")], "licence") == ["Apache-2.0", "MIT"]
+    assert [passes(row, {"licence": each}) for each in ("MIT", "Apache-2.0", "BSD")] == [1, 1, 0]
+
+
+def test_known_facts_are_joined_in_one_line():
+    row = Row("d", "d", dof=3, reach=0.5, mass=1.25, findings=())
+    assert facts_line(row) == "3 DoF · 0.50 m · 1.25 kg"
+    assert facts_line(Row("d", "d")) == ""
+
+
+def test_licences_of_parts_are_shown_with_their_restrictions():
+    assert licence_line(arm()) == ""
+    parts = [{"licence": each} for each in ("MIT", "CC-BY-NC-SA-4.0", "MIT")]
+    line = licence_line(replace(arm(), provenance={"parts": parts}))
+    assert re.sub("<[^>]*>", "", line) == (
+        "licences of its parts: MIT, CC-BY-NC-SA-4.0 non-commercial, share-alike"
+    )
+
+
+def test_joints_are_grouped_by_their_part():
+    robot = arm()
+    assert [(chain.title, chain.rows) for chain in joint_groups(robot)] == [
+        ("joints", (0, 1, 2, 3))
+    ]
+    renamed = tuple(
+        replace(joint, name=f"{'ee' if i > 2 else 'arm'}_{joint.name}", mimic=None, limits=(-1, 1))
+        for i, joint in enumerate(robot.joints)
+    )
+    parts = [{"label": "arm", "part": "x"}, {"label": "ee", "part": "y"}]
+    named = replace(robot, joints=renamed, home=(0,) * 5, provenance={"parts": parts})
+    assert [(c.title, c.rows) for c in joint_groups(named)] == [
+        ("arm (x)", (0, 1, 2)),
+        ("ee (y)", (3, 4)),
+    ]
+
+
+def test_slider_hint_names_joint_type_and_limits():
+    assert joint_hint(arm().joints[0]) == (
+        "shoulder: revolute, -2 to 2 rad, at most 50 N m, 2 rad/s"
+    )
+    assert joint_hint(arm().joints[2]).startswith("extend: prismatic, 0 to 0.04 m, at most 20 N")
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "step"), [(-3.14, 3.14, 0.01), (0, 0.04, 0.0001), (0, 0, 0.001), (-1, 1, 0.01)]
+)
+def test_slider_steps_are_round_and_small(low, high, step):
+    assert slider_step(low, high) == pytest.approx(step)
+
+
+def test_tables_name_every_link_and_escape_it():
+    robot = arm()
+    table = link_table(robot)
+    assert all(link.name in table for link in robot.links)
+    assert "prismatic (mimic)" in table
+    odd = replace(
+        robot,
+        links=(replace(robot.links[0], name="<b>"), *robot.links[1:]),
+        joints=(replace(robot.joints[0], parent="<b>"), *robot.joints[1:]),
+    )
+    assert "&lt;b&gt;" in link_table(odd)
+    assert "<b>" not in link_card(odd, "<b>", ())
+    assert "mimics" in link_card(robot, "right", ())
+    assert summary(robot, 0.9).startswith("6 links · 4 DoF · 1 mimic joint · ")
+
+
+def test_configurations_are_restored_from_urls():
+    robot = arm()
+    q = np.array([0.1234, -1.5, 0.02, 0.04])
+    assert parse_joints(format_joints(q), robot) == pytest.approx(q)
+    assert parse_joints("9,9,9,9", robot) == pytest.approx([2, 2, 0.04, 0.04])
+    for bad in ("", "1,2", "a,b,c,d", "nan,0,0,0"):
+        assert parse_joints(bad, robot) is None
+
+
+def test_the_box_has_the_inertia_of_the_link():
+    a, b, c, m = 0.1, 0.2, 0.3, 2.0
+    moments = np.array([b * b + c * c, a * a + c * c, a * a + b * b]) * m / 12
+    box = inertia_box(Inertial.from_matrix(m, (0, 0, 0), np.diag(moments)))
+    assert box is not None
+    sizes, axes = box
+    rebuilt = axes @ np.diag(m / 12 * (np.sum(sizes**2) - sizes**2)) @ axes.T
+    assert rebuilt == pytest.approx(np.diag(moments))
+    assert np.linalg.det(axes) == pytest.approx(1)
+    assert inertia_box(Inertial(0.0)) is None
+    assert inertia_box(Inertial.from_matrix(1.0, (0, 0, 0), np.diag([1.0, 0.1, 0.1]))) is None
+
+
+def poses(q):
+    return forward_kinematics(arm(), q)
+
+
+def on_screen(page, camera, point):
+    """Return where a point of the world is in the window [pixels]."""
+    box = page.locator("canvas").first.bounding_box()
+    rotation = np.array(to_matrix(tuple(camera.wxyz)))
+    view = View(np.array(camera.position), rotation, camera.fov, camera.aspect)
+    x, y = project_points(view, point)[0] * box["height"]
+    return box["x"] + x, box["y"] + y
+
+
+def test_a_dragged_joint_takes_the_gripped_point_to_the_pointer():
+    robot, q = arm(), np.array([0.4, 0.5, 0.01, 0.02])
+    point, link = np.array([0.0, 0.0, 0.3]), robot.link_index["upper"]
+    goal = poses([1.3, 0.5, 0.01, 0.02])[link] @ [*point, 1]
+    turned = turn_towards(robot, q, 0, link, point, goal[:3])
+    assert turned == pytest.approx([1.3, 0.5, 0.01, 0.02], abs=1e-3)
+
+
+def test_a_dragged_joint_keeps_its_limits_and_mimics_are_dragged_by_their_leader():
+    robot, q = arm(), np.array([0.4, 0.5, 0.01, 0.02])
+    right = robot.link_index["right"]
+    row = joint_of_link(robot, right)
+    assert row == 3
+    away = poses(q)[right, :3, 3] + 10 * poses(q)[right, :3, 1]
+    assert turn_towards(robot, q, row, right, np.zeros(3), away)[3] == 0
+    assert turn_towards(robot, q, row, right, np.zeros(3), -away)[3] == 0.04
+
+
+def test_a_point_on_the_axis_does_not_turn_the_joint():
+    robot, q = arm(), np.array([0.4, 0.5, 0.01, 0.02])
+    link = robot.link_index["upper"]
+    assert turn_towards(robot, q, 0, link, np.zeros(3), np.ones(3)) == pytest.approx(q)
+
+
+def test_the_range_of_a_hinge_is_an_arc_between_its_limits():
+    joint = arm().joints[0]
+    needle, track, axis = range_lines(joint, 0.2, (0.0, 0.0, 1.0))
+    assert np.linalg.norm(track[:-2], axis=-1) == pytest.approx(0.2, abs=1e-9)
+    angles = [np.arctan2(p[0], p[2]) for p in (track[0, 0], track[-3, 1])]
+    assert angles == pytest.approx(joint.limits)
+    assert np.cross(axis[0, 1] - axis[0, 0], joint.axis) == pytest.approx(0)
+    assert needle @ joint.axis == pytest.approx(0)
+
+
+def test_the_range_of_a_slide_is_a_line_between_its_limits():
+    joint = finger().joints[0]
+    _, track, _ = range_lines(joint, 0.2, (1.0, 0.0, 0.0))
+    assert track[0] == pytest.approx(np.array([[0, -3, 0], [0, 3, 0]]))
+
+
+def test_a_card_shows_mass_limits_in_both_units_and_the_findings_of_its_link():
+    robot = arm()
+    findings = [
+        Finding("a", "warning", "link upper", "too heavy", "make it lighter"),
+        Finding("b", "error", "joint shoulder", "too weak", "make it stronger"),
+        Finding("c", "info", "link lower", "something else", "nothing"),
+    ]
+    card = link_card(robot, "upper", findings)
+    assert f"{robot.link('upper').inertial.mass:.4g} kg" in card
+    assert "-2 to 2 rad (-115 to 115°)" in card
+    assert "too heavy" in card
+    assert "too weak" in card
+    assert "something else" not in card
+    assert "none, it is the root" in link_card(robot, "base", ())
+
+
+def test_a_finding_is_about_the_links_and_joints_that_it_names():
+    pair = Finding("x", "warning", "links upper, lower", "", "")
+    assert is_about(pair, "upper", "")
+    assert is_about(pair, "lower", "")
+    assert not is_about(pair, "low", "")
+    assert not is_about(Finding("x", "info", "joint ", "", ""), "base", "")
+
+
+def test_a_click_selects_a_link_and_a_drag_turns_its_joint(viewer):
+    on = viewer()
+    with PlainClient(on.port, ARM) as client:
+        client.shows("no Compose: it is not made of parts")
+        client.shows("no self-collision")
+        frame = client.until(
+            lambda: next((m for m in client.messages if m.get("name") == "/robot/1"), None)
+        )
+        view = nodes(on)
+        click = pointer("Click", frame)
+        client.send(click)
+        client.shows("link=upper")
+        client.until(lambda: "/robot/1/outline0" in view)
+        robot = arm()
+        grip = poses(robot.home)[1] @ [0, 0, 0.3, 1]
+        start = grip[:3].tolist()
+        drag = pointer("Drag", frame, phase="start", start_position=start, end_position=start)
+        client.send(drag)
+        goal = poses([1.0, *robot.home[1:]])[1] @ [0, 0, 0.3, 1]
+        client.send({**drag, "phase": "update", "end_position": goal[:3].tolist()})
+        client.until(lambda: "/robot/0/range" in view)
+        client.shows("q=1,0.5,0.01,0.02")
+        client.send({**drag, "phase": "end", "end_position": goal[:3].tolist()})
+        client.until(lambda: "/robot/0/range" not in view)
+        client.send(click)
+        client.until(lambda: "/robot/1/outline0" not in view)
+
+
+@pytest.mark.slow
+def test_pointer_selects_drags_and_shows_ranges(see, viewer, picture):
+    on = viewer()
+    page = see(f"{ARM}&link=lower&angles=deg", on=on)
+    page.get_by_text("no self-collision").wait_for()
+    (session,) = on.sessions.values()
+    assert "/robot/2/outline0" in nodes(on)
+    assert field(page, "shoulder").last.input_value() == "23"
+    page.get_by_text("shoulder", exact=True).hover()
+    page.wait_for_timeout(1500)
+    assert "/robot/0/range" in nodes(on)
+    picture(page, "robot-selection")
+    page.mouse.move(300, 100)
+    page.wait_for_timeout(1500)
+    assert "/robot/0/range" not in nodes(on)
+    middle = (poses(arm().home)[1] @ [0, 0, 0.15, 1])[:3]
+    x, y = on_screen(page, session.client.camera, middle)
+    page.mouse.click(x, y)
+    page.wait_for_url(re.compile("link=upper"))
+    page.mouse.move(x, y)
+    page.mouse.down()
+    for i in range(8):
+        page.mouse.move(x + 8 * i, y)
+        page.wait_for_timeout(100)
+    page.mouse.up()
+    page.wait_for_url(re.compile("q="))
+    assert "link=upper" in page.url
+    assert page.failures == []
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """Points in a spherical shell with radii 0.5 to 1 m around (0, 0, 0.3)."""
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(200_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return rng.uniform(0.5, 1.0, (200_000, 1)) * directions + [0, 0, 0.3]
+
+
+def test_the_shell_encloses_the_points(ball):
+    vertices, faces = workspace.shell(ball)
+    a, b, c = (vertices[faces[:, k]].astype(float) for k in range(3))
+    volume = (a * np.cross(b, c)).sum() / 6
+    assert volume == pytest.approx(4 / 3 * np.pi, rel=0.05)
+
+
+def test_a_slice_has_the_hole_of_the_workspace(ball):
+    section = workspace.cut(ball, 0.0)
+    radii = np.linalg.norm(section.centres - [0, 0, 0.3], axis=1)
+    assert radii.min() > 0.5 - 2 * section.side
+    assert radii.max() < 1.0 + 2 * section.side
+    assert len(radii) * section.side**2 == pytest.approx(np.pi * 0.75, rel=0.15)
+    assert section.density.max() == pytest.approx(1.0)
+
+
+def test_toggles_draw_grown_shapes_names_boxes_and_the_workspace(viewer):
+    on = viewer()
+    shown = "visual,collision,inertia,x-ray,frames,joint axes,centres of mass,names,workspace"
+    with PlainClient(on.port, f"{ARM}&show={shown}&slice=0.05") as client:
+        client.shows("no self-collision")
+        nodes = scene_nodes(on)
+        client.until(lambda: "/robot/workspace_slice" in nodes)
+        client.shows("slice=0.05")
+        client.shows("200,000 random configurations")
+        slide = client.control("Slider", "slice at y [m]")
+        client.change(slide, 0.03)
+        client.shows("slice=0.03")
+        assert nodes["/robot/1/visual0"].opacity == pytest.approx(0.2)
+        assert nodes["/robot/1/name"].text == "upper"
+        assert {"/robot/1/inertia", "/robot/1/axis", "/robot/1/com"} <= nodes.keys()
+        assert nodes["/robot/1"].show_axes
+        radius = np.linalg.norm(nodes["/robot/1/collision0"].vertices[:, :2], axis=1).max()
+        assert 0.0205 < radius < 0.03  # the cylinder has 0.02 m
+        client.change(client.control("Checkbox", "visual"), False)
+        client.shows("show=collision,inertia,x-ray,frames")
+        assert nodes["/robot/1/visual0"].visible
+        client.change(client.control("Checkbox", "x-ray"), False)
+        client.until(lambda: not nodes["/robot/1/visual0"].visible)
+        client.until(
+            lambda: (
+                np.linalg.norm(nodes["/robot/1/collision0"].vertices[:, :2], axis=1).max() < 0.0201
+            )
+        )
+        client.change(client.control("Checkbox", "workspace"), False)
+        client.until(lambda: "/robot/workspace" not in nodes)
+
+
+def test_findings_about_inertia_are_written_beside_the_boxes(shared_viewer, folder):
+    links = [replace(link, inertial=None) if link.name == "lower" else link for link in arm().links]
+    write_bundle(replace(arm(), links=tuple(links)), folder / "robots" / "light", picture=False)
+    with PlainClient(shared_viewer.port, "?robot=robots/light&show=visual,inertia") as client:
+        (found,) = client.until(
+            lambda: [
+                m["props"]["text"]
+                for m in client.messages
+                if m["type"] == "LabelMessage" and "lower" in m["props"]["text"]
+            ]
+        )
+        assert found == "lower: inertia-missing"
+
+
+POINT = np.zeros(3)
+LOW, HIGH = np.array([-1.0, -0.2, 0.0]), np.array([1.0, 0.2, 0.5])
+
+
+class Camera(SimpleNamespace):
+    """A camera of a browser with a picture of an aspect."""
+
+    def __init__(self, aspect):
+        callbacks = []
+        state = SimpleNamespace(camera_cb=callbacks)
+        super().__init__(aspect=aspect, position=np.zeros(3), callbacks=callbacks, _state=state)
+
+    def on_update(self, callback):
+        self.callbacks.append(callback)
+
+    def resize(self, aspect):
+        self.aspect = aspect
+        for callback in self.callbacks:
+            callback(self)
+
+    @property
+    def distance(self):
+        return float(np.linalg.norm(self.position - self.look_at))
+
+
+def looking(aspect):
+    camera = Camera(aspect)
+    look_at(SimpleNamespace(camera=camera), LOW, HIGH, (0.0, -1.0, 0.2))
+    return camera
+
+
+@pytest.mark.parametrize("before", [0.14, 1.5])
+def test_the_camera_is_placed_again_when_panels_open_or_close(before):
+    camera = looking(before)
+    camera.resize(0.9)
+    assert camera.distance == pytest.approx(looking(0.9).distance)
+    assert camera.distance > 1.2 * looking(1.5).distance
+
+
+def test_the_strip_beside_a_gallery_does_not_decide_the_distance():
+    assert looking(0.14).distance == looking(1.0).distance
+
+
+def test_a_camera_that_the_user_has_moved_stays():
+    camera = looking(1.2)
+    camera.position = camera.position + 0.1
+    before = camera.position.copy()
+    camera.resize(0.9)
+    np.testing.assert_array_equal(camera.position, before)
+
+
+def test_a_robot_without_shapes_has_a_scale_bar():
+    labels = []
+    scene = SimpleNamespace(
+        add_batched_meshes_simple=lambda *args, **options: None,
+        add_label=lambda name, text, position: labels.append(text),
+    )
+    add_scale_bar(scene, POINT, POINT, (1.0, 0.0, 0.0))
+    assert labels == ["1 cm"]
