@@ -52,6 +52,15 @@ def test_a_process_that_dies_while_results_are_used_is_reported():
         list(map(slowly, parallel_map(die_at_three, range(40), 2, chunk=1)))
 
 
+@pytest.fixture
+def _ctrl_c():
+    """Heed Ctrl-C, which background processes of a shell ignore."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("_ctrl_c")
 def test_ctrl_c_between_a_lock_and_its_release_ends_the_pool(monkeypatch):
     enter = Condition.__enter__
 

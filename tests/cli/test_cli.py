@@ -173,13 +173,6 @@ def test_a_missing_folder_does_not_stop_other_exports(run):
     )
 
 
-def test_a_file_of_any_suffix_is_a_robot(run):
-    assert run("compose", "base=gantry", "ee=plane", "--no-picture")[0] == 0
-    Path("robots/gantry-plane/robot.xml").rename("gantry.mjcf")
-    code, out, _ = run("check", "gantry.mjcf")
-    assert (code, out.splitlines()[0][:13]) == (0, "gantry.mjcf: ")
-
-
 def test_places_that_cannot_be_written_are_refused_before_the_work(refused, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write anywhere
     assert "--csv a.csv: folder . cannot be written" in refused(
@@ -193,6 +186,7 @@ def test_files_and_folders_beside_a_part_do_not_hide_it(ok, refused):
     Path("arms").mkdir()
     Path("arms/my_arm.urdf").touch()
     ok("check", "plane")  # the part
+    ok("fit", "plane")
     assert refused("check", "arms").endswith("; did you mean arms/my_arm.urdf?\n")
 
 
@@ -360,13 +354,13 @@ def test_demo_prints_one_line_if_it_cannot_write(run):
     assert err.count("\n") == 1
 
 
-def test_check_and_show_read_an_mjcf(run, ok, tmp_path):
-    path = write(tmp_path, TWO_JOINTS)
+def test_check_and_show_read_an_mjcf_of_any_suffix(run, ok, tmp_path):
+    path = write(tmp_path, TWO_JOINTS, "robot.mjcf")
     out = ok("check", path, "--json")
     assert {f["code"] for f in json.loads(out)[str(path)]["findings"]} == {
         *("effort-missing", "velocity-missing", "self-collision")
     }
-    code, out, _ = run("show", "robot.xml")
+    code, out, _ = run("show", "robot.mjcf")
     assert (code, out.splitlines()[0]) == (0, "test: 3 links, 2 DoF, 12.57 kg")
 
 

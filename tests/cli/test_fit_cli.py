@@ -81,10 +81,11 @@ def test_part_made_of_primitives_keeps_them(run, ok):
     assert data["findings"] == []
 
 
-def test_bundle_may_have_the_name_of_its_part(run, ok, tmp_path):
-    out = ok("fit", "plane", "--out", "plane", "--no-picture", "--visual")
+def test_a_bundle_with_a_picture_may_have_the_name_of_its_part(ok):
+    out = ok("fit", "plane", "--out", "plane", "--visual", "--configurations", "1")
     assert out.splitlines()[-1] == "plane"
-    assert run("check", "plane")[0] == 0
+    assert Path("plane/preview.png").is_file()
+    ok("check", "plane/")
 
 
 def test_user_part_is_found_in_the_given_library(ok, tmp_path):
@@ -146,11 +147,6 @@ def urdf_of(folder, *files):
     return "robot.urdf"
 
 
-def test_picture_is_written_by_default(run, tmp_path):
-    assert run("fit", "plane", "--out", "made", "--configurations", "1")[0] == 0
-    assert (tmp_path / "made" / "preview.png").is_file()
-
-
 def flat(path):
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n")
     return path
@@ -169,12 +165,6 @@ def test_flat_link_is_reported_and_the_others_are_fitted(ok, box, tmp_path, outp
         _, _, row, _, finding = out.splitlines()
         assert row.split()[:2] == ["link", "box"]
         assert finding.startswith("warning no-primitive at link leaf: ")
-
-
-def test_folder_named_like_a_part_does_not_hide_the_part(run, tmp_path):
-    (tmp_path / "plane").mkdir()
-    code, out, _ = run("fit", "plane", "--json")
-    assert (code, [link["link"] for link in json.loads(out)["links"]]) == (0, ["plate"])
 
 
 @pytest.mark.parametrize("source", ["plane", "robot"])

@@ -50,11 +50,6 @@ def test_table_has_one_row_per_goal_set(ok, path, goal_cache):
     assert len(list((goal_cache / "goals-5").iterdir())) == 3
 
 
-def test_certify_option_adds_certificates(ok, path):
-    out = ok("goals", path, "--certify")
-    assert [line.split()[-1] for line in out.splitlines()[2:-1]] == ["yes"] * 3
-
-
 def test_json_option_prints_only_json(run, ok, path):
     out = ok("goals", path, "--json", "--seed", 3, "--certify")
     data = json.loads(out)

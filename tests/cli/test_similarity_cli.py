@@ -64,11 +64,10 @@ def test_folder_of_bundles_gives_one_matrix_per_measure(ok, bundles, tmp_path):
         assert statistics.startswith("3 pairs: mean ")
 
 
-def test_json_holds_the_matrices(ok, bundles):
-    out = ok("similarity", *ARGUMENTS, "--json")
-    data = json.loads(out)
+def test_json_holds_the_matrices_and_csv_has_one_line_per_pair(ok, bundles):
+    data = json.loads(ok("similarity", *ARGUMENTS, "--csv", "pairs.csv", "--json"))
     assert data["robots"] == ["arm", "lwr-claw", "lwr-plane"]
-    assert data["files"] == []
+    assert data["files"] == ["pairs.csv"]
     assert list(data["measures"]) == list(MEASURES)
     robot_features = [features(robot, token_shapes(robot)) for robot in bundles]
     for name, about in data["measures"].items():
@@ -76,6 +75,13 @@ def test_json_holds_the_matrices(ok, bundles):
         np.testing.assert_allclose(
             about["matrix"], similarity_matrix(robot_features, name), atol=1e-6
         )
+    with Path("pairs.csv").open(newline="") as lines:
+        rows = list(csv.DictReader(lines))
+    pairs = [("arm", "lwr-claw"), ("arm", "lwr-plane"), ("lwr-claw", "lwr-plane")]
+    assert [(row["robot"], row["other"]) for row in rows] == pairs
+    for name, about in data["measures"].items():
+        values = np.array(about["matrix"])[np.triu_indices(3, 1)]
+        assert [float(row[name]) for row in rows] == values.tolist()
 
 
 def test_paths_can_be_mixed_and_duplicates_are_dropped(ok, bundles, light_set):
@@ -106,21 +112,6 @@ def test_more_than_twenty_robots_list_the_nearest_of_each(run, ok):
         assert float(value) == pytest.approx(np.nanmax(values[i]), abs=6e-4)
         assert float(mean) == pytest.approx(np.nanmean(values[i]), abs=6e-4)
     assert statistics.startswith("210 pairs: ")
-
-
-def test_csv_has_one_line_per_pair(ok, bundles):
-    out = ok("similarity", *ARGUMENTS, "--csv", "pairs.csv", "--json")
-    assert json.loads(out)["files"] == ["pairs.csv"]
-    with Path("pairs.csv").open(newline="") as lines:
-        rows = list(csv.DictReader(lines))
-    assert [(row["robot"], row["other"]) for row in rows] == [
-        ("arm", "lwr-claw"),
-        ("arm", "lwr-plane"),
-        ("lwr-claw", "lwr-plane"),
-    ]
-    for name, about in json.loads(out)["measures"].items():
-        values = np.array(about["matrix"])[np.triu_indices(3, 1)]
-        assert [float(row[name]) for row in rows] == values.tolist()
 
 
 def test_pictures_are_written(ok, bundles, tmp_path):

@@ -36,8 +36,9 @@ DEGREES_OF_FREEDOM = {
     7: "panda kinova_gen3 jaco2 xarm7 lwr iiwa14 yumi_left yumi_right",
     14: "yumi",
 }
-DETAILED = {"so101", "so101_gripper", "yumi", "yumi_left", "z1", "z1_gripper"}
-"""Parts whose meshes take seconds each."""
+DETAILED = {"so101", "so101_gripper", "yumi", "yumi_left", "yumi_right", "z1", "z1_gripper"}
+DETAILED |= {"baxter_left", "jaco2", "jaco2_6dof_spherical", "tiago_pro_left", "ur10"}
+"""Parts whose meshes take long, and parts much like them whose test is quick."""
 ANTHROPOMORPHIC = {"allegro", "dex3"}
 """Hands whose fingers oppose each other beside the axis of the wrist."""
 
