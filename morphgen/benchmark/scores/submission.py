@@ -162,7 +162,7 @@ ROUNDING = 1e-4
 exceed its range by."""
 RANDOM_TOLERANCE = 1.0
 """Largest difference of the mean scores of the same episodes of the random policy: processors
-differ in the last bits, as for ``SCORE_TOLERANCE`` of ``tests/doctor/test_versions.py``."""
+differ in the last bits, as for ``SCORE_TOLERANCE`` of ``tests/doctor/test_diagnosis.py``."""
 RANDOM_ERRORS = 4.0
 """Largest difference of the mean scores of different episodes of it [standard errors]."""
 
