@@ -222,7 +222,7 @@ def test_steps_and_resets_read_no_tensor(specs, names):
     controller.act(batch)  # fills caches of constants
     batch.simulation.diverges[2] = True
     with device_reads() as reads:
-        results = [batch.step(controller.act(batch)) for _ in range(60)]
+        results = [batch.step(controller.act(batch)) for _ in range(2 * PUSH.max_episode_steps)]
         batch.advance(0.3)
         batch.reset(seed=4, spread=True)
     assert reads.found == []
