@@ -121,6 +121,7 @@ class Track:
     score: list[float] = field(default_factory=list)
     distance: list[float] = field(default_factory=list)
     success: list[bool] = field(default_factory=list)
+    reward: list[float] = field(default_factory=list)  # of demonstrations, which have them
     fault: str = ""  # error that ended the episode early; empty without error
 
     @property

@@ -8,17 +8,24 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
 from morphgen.errors import MorphgenError, SimulationError
+from morphgen.files import file_stamp
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import split_colours
 from morphgen.grammar.grammar_file import SUFFIX
 from morphgen.grammar.robot_source import is_robot_file
+from morphgen.model.robot import Robot
+from morphgen.processes import one_torch_thread
 from morphgen.rl.baselines import BASELINES, Controller
+from morphgen.rl.demonstrations.lerobot import BODIES, INFO
+from morphgen.rl.demonstrations.reader import Demonstrations
 from morphgen.rl.inference import ControllerSpec, make_env_and_controller, read_controller
 from morphgen.rl.runs.checkpoint import read_checkpoint
 from morphgen.rl.runs.robot_source import (
@@ -30,14 +37,15 @@ from morphgen.rl.runs.robot_source import (
     tasks_of,
 )
 from morphgen.rl.shipped_policies import is_named, policies_for
+from morphgen.tasks.batch import BeforePhysics, TaskBatch
 from morphgen.tasks.gym.env import TaskEnv
 from morphgen.tasks.registry import TASKS
-from morphgen.tasks.render.renderer import render_state
+from morphgen.tasks.render.renderer import RenderState, render_state
 from morphgen.tasks.scenes.env_specs import load_robot
 from morphgen.tasks.sim.articulated import ArticulatedObject
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Block
 from morphgen.viewer.app.address import MAX_PLAYED
-from morphgen.viewer.episode import BLOCK, Array, Episode, Track
+from morphgen.viewer.episode import BLOCK, Array, Episode, EpisodeError, Track
 from morphgen.viewer.robot_uri import (
     DEFAULT_WORDS,
     DERIVATION,
@@ -156,22 +164,31 @@ def _start_robot(
     with contextlib.ExitStack() as stack:
         stack.callback(env.close)
         env.batch.reset(config.seed)
-        start, env_spec = render_state(env.batch), env.env_spec
-        thing = env_spec.scene.object
-        poses = {**start.markers} | ({} if start.block is None else {BLOCK: start.block})
-        track = Track(
-            split_colours(robot),
-            uri,
-            env_spec.scene.ground,
-            env.batch.layouts.obstacles(0),
-            TASKS[env_spec.task].markers(env_spec.config, env_spec.goals),
-            thing.size if isinstance(thing, Block) else None,
-            thing if isinstance(thing, ArticulatedObject) else None,
-            [start.q],
-            {name: [pose] for name, pose in poses.items()},
-        )
+        track = _track(robot, uri, env.batch)
         stack.pop_all()  # keeps the environment open
         return _SimulatedRobot(env, controller, track)
+
+
+def _track(robot: Robot, uri: str, batch: TaskBatch) -> Track:
+    """Return the track of a robot at the start of its episode in the first environment."""
+    start, spec = render_state(batch), batch.specs[0]
+    thing = spec.scene.object
+    return Track(
+        split_colours(robot),
+        uri,
+        spec.scene.ground,
+        batch.layouts.obstacles(0),
+        TASKS[spec.task].markers(spec.config, spec.goals),
+        thing.size if isinstance(thing, Block) else None,
+        thing if isinstance(thing, ArticulatedObject) else None,
+        [start.q],
+        {name: [pose] for name, pose in _poses(start).items()},
+    )
+
+
+def _poses(state: RenderState) -> dict[str, Array]:
+    """Return the poses of a state as of a track."""
+    return {**state.markers} | ({} if state.block is None else {BLOCK: state.block})
 
 
 def _step(robot: _SimulatedRobot) -> None:
@@ -201,6 +218,71 @@ def _step(robot: _SimulatedRobot) -> None:
 
 def _to_numpy(values: torch.Tensor) -> Array:
     return np.array(values.cpu().numpy(), dtype=np.float32)
+
+
+@lru_cache(maxsize=1)
+def _read_demonstrations(folder: Path, stamp: object) -> Demonstrations:
+    del stamp  # a data set that was recorded anew is read again
+    return Demonstrations(folder)
+
+
+def _demonstrations(folder: str, files: FileAccess) -> Demonstrations:
+    path = files.path(folder)
+    return _read_demonstrations(path, file_stamp(path / INFO))
+
+
+def list_episodes(
+    folder: str, files: FileAccess
+) -> tuple[list[tuple[str, str]], list[tuple[int, str, bool]]]:
+    """Return names and hashes of the robots of demonstrations, and facts of each episode.
+
+    The facts are the number of the robot, the task, and whether it was done.
+    """
+    demos = _demonstrations(folder, files)
+    episodes = [(each.robot_index, each.task, each.success) for each in demos.episodes]
+    return [*zip(demos.robot_names, demos.robot_hashes, strict=True)], episodes
+
+
+@one_torch_thread()
+def recorded_episode(folder: str, index: int, files: FileAccess) -> Episode:
+    """Return an episode of demonstrations, in the states that were recorded.
+
+    The state after the last step was not: the one before it is shown twice.
+    """
+    demos = _demonstrations(folder, files)
+    if not 0 <= index < len(demos.episodes):
+        last = len(demos.episodes) - 1
+        raise UriError(f"{folder} has no episode {index}; expected a number from 0 to {last}")
+    recorded, batch = demos.episodes[index], demos.episode_batch(index)
+    uri = f"{folder.rstrip('/')}/{BODIES}/{recorded.robot_hash}"
+    if not (batch.q.isfinite().all() and batch.simulation.object_pose.isfinite().all()):
+        raise EpisodeError(f"{folder}: the states of episode {index} are not finite")
+    track, steps = _track(read_robot_uri(uri, files), uri, batch), recorded.length
+    for env in (*range(1, steps), steps - 1):
+        state = render_state(batch, env)
+        track.q.append(state.q)
+        for name, pose in _poses(state).items():
+            track.poses[name].append(pose)
+    # What the task says of a state is the result of the step that led there.
+    still = BeforePhysics(batch.targets, batch.q, batch.simulation.object_pose)
+    results = batch.finish(still, torch.zeros(batch.num_envs, dtype=torch.bool))
+    track.distance = [*results.distance[1:].tolist(), recorded.distance]
+    track.score = results.score[1:].tolist()
+    score_of, total = TASKS[recorded.task].episode_score, sum(track.score)
+    at_zero, at_one = (score_of(total + last, last, steps) for last in (0.0, 1.0))
+    track.score.append((recorded.score - at_zero) / (at_one - at_zero))
+    rows = slice(recorded.first, recorded.first + steps)
+    track.success = demos.columns["next.success"][rows].tolist()
+    track.reward = demos.columns["next.reward"][rows].tolist()
+    return Episode(
+        recorded.task,
+        recorded.policy,
+        recorded.seed,
+        bool(track.obstacles),
+        demos.settings["sim"],
+        CONTROL_PERIOD,
+        [track],
+    )
 
 
 STEPS_AHEAD = 5  # control steps that are simulated at once, while the ones before are shown

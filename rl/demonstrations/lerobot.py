@@ -2,7 +2,7 @@
 
 LeRobot itself is not used: it needs other versions of torch and NumPy. Arms differ in their joints:
 features of joints are padded with zeros to the largest robot, and ``joint_count`` says how many are
-real. ``robot_index`` is the line of the robot in ``bodies/index.jsonl``. The same episodes give
+real. ``robot_index`` is the line of the robot in ``bodies/robots.jsonl``. The same episodes give
 the same bytes with the same version of pyarrow.
 """
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import pyarrow
 
 BODIES = "bodies"  # folder with the bundle of each robot, by its hash
-RECORDING, INDEX, BODY = "recording.json", "bodies/index.jsonl", "body.json"
+RECORDING, INDEX, BODY = "recording.json", "bodies/robots.jsonl", "body.json"
 FORMAT = 1  # version of what morphgen adds to the format of LeRobot
 Arrays = dict[str, NDArray[Any]]
 
@@ -60,6 +60,11 @@ def require_pyarrow() -> None:
     """Require the optional package that reads and writes Parquet."""
     with explain_missing_extras("demos"):
         import pyarrow.parquet  # noqa: F401
+
+
+def is_data_set(folder: Path) -> bool:
+    """Return whether a folder is, or is to become, a data set: of ``record`` or any LeRobot."""
+    return any((folder / name).is_file() for name in (RECORDING, INFO))
 
 
 def read_shard(path: Path) -> tuple[list[dict[str, Any]], Arrays]:
@@ -333,7 +338,10 @@ def _write_json(path: Path, data: object) -> None:
 
 def read_index(folder: Path) -> list[dict[str, Any]]:
     """Return the rows of the robots, which ``robot_index`` refers to."""
-    return [parse_json(line, INDEX) for line in read_text(folder / INDEX).splitlines()]
+    path = folder / INDEX
+    if not path.is_file():  # its name in the first data sets
+        path = path.with_name("index.jsonl")
+    return [parse_json(line, INDEX) for line in read_text(path).splitlines()]
 
 
 def read_episodes(folder: Path) -> Iterator[dict[str, Any]]:

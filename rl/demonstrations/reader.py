@@ -75,6 +75,7 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
         episodes: The episodes, in order.
         columns: All steps by feature.
         robot_hashes: Hashes of the robots, which ``robot_index`` refers to.
+        robot_names: Their names.
     """
 
     def __init__(self, path: str | PathLike[str]) -> None:
@@ -93,11 +94,13 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
             self.settings: dict[str, Any] = read_json(self.folder / RECORDING)
             if self.settings["format"] != FORMAT:
                 raise ValueError(f"format {self.settings['format']!r}; this version reads {FORMAT}")
-            self.robot_hashes = tuple(body["robot_hash"] for body in read_index(self.folder))
+            bodies = read_index(self.folder)
+            self.robot_hashes = tuple(body["robot_hash"] for body in bodies)
             if not all(map(_HASH.fullmatch, self.robot_hashes)):  # they name folders
                 raise ValueError(f"{INDEX}: expected hashes of {HASH_LENGTH} hexadecimal digits")
             if len(set(self.robot_hashes)) < len(self.robot_hashes):
                 raise ValueError(f"{INDEX}: names a robot twice")
+            self.robot_names = tuple(str(body["name"]) for body in bodies)
             self.columns = {
                 name: torch.from_numpy(np.array(values))
                 for name, values in read_columns(self.folder).items()
@@ -111,6 +114,7 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
         except (OSError, *_FAULTS) as error:
             why = one_line(str(error))
             raise FormatError(f"{self.folder} is no sound data set: {why}") from error
+        self._robots: dict[int, Robot] = {}
         self._tables: dict[int, RobotTables] = {}
 
     def _read_episodes(self) -> Iterator[RecordedEpisode]:
@@ -165,13 +169,19 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
         """Return the features of several steps, as ``DataLoader`` asks for them."""
         return [self[frame] for frame in frames]
 
-    @cached_property
+    @property
     def robots(self) -> tuple[Robot, ...]:
         """The robots, which ``robot_index`` refers to, with primitives as collision shapes."""
-        robots = tuple(load_robot(self.folder / BODIES / each) for each in self.robot_hashes)
-        if max(robot.dof for robot in robots) > self.columns["observation.state"].shape[1]:
-            raise FormatError(f"{self.folder}: a robot has more joints than the steps")
-        return robots
+        return tuple(self.robot(index) for index in range(len(self.robot_hashes)))
+
+    def robot(self, robot_index: int) -> Robot:
+        """Return one of ``robots``; it is read once."""
+        if robot_index not in self._robots:
+            robot = load_robot(self.folder / BODIES / self.robot_hashes[robot_index])
+            if robot.dof > self.columns["observation.state"].shape[1]:
+                raise FormatError(f"{self.folder}: a robot has more joints than the steps")
+            self._robots[robot_index] = robot
+        return self._robots[robot_index]
 
     @cached_property
     def configs(self) -> tuple[TaskConfig, ...]:
@@ -184,18 +194,18 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
     @cached_property
     def specs(self) -> Mapping[tuple[int, str], EnvSpec]:
         """Environments by robot index and task, with the goals of the data set."""
-        configs = {each.task: each for each in self.configs}
         keys = dict.fromkeys((episode.robot_index, episode.task) for episode in self.episodes)
-        specs = {}
-        for robot_index, task in keys:
-            robot, kind = self.robots[robot_index], TASKS[task]
-            path = self.folder / BODIES / self.robot_hashes[robot_index] / "goals" / f"{task}.npz"
-            goals = goals_from_npz(read_bytes(path), task, path)
-            if goals.q.shape[1] != robot.dof:
-                raise FormatError(f"{path}: goals of {goals.q.shape[1]} joints, not {robot.dof}")
-            scene = kind.scene(robot, goals, ground_under(robot))
-            specs[robot_index, task] = EnvSpec(robot, task, scene, goals, configs[task])
-        return specs
+        return {key: self.spec(*key) for key in keys}
+
+    def spec(self, robot_index: int, task: str) -> EnvSpec:
+        """Return one of ``specs``; no other robot is read."""
+        robot, kind = self.robot(robot_index), TASKS[task]
+        path = self.folder / BODIES / self.robot_hashes[robot_index] / "goals" / f"{task}.npz"
+        goals = goals_from_npz(read_bytes(path), task, path)
+        if goals.q.shape[1] != robot.dof:
+            raise FormatError(f"{path}: goals of {goals.q.shape[1]} joints, not {robot.dof}")
+        config = next(each for each in self.configs if each.task == task)
+        return EnvSpec(robot, task, kind.scene(robot, goals, ground_under(robot)), goals, config)
 
     def observe(
         self,
@@ -270,6 +280,26 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
         batch.previous_action.copy_(before.masked_fill(starts, 0))
         action = at_links(batch, columns["normalized_action"])
         return batch, encode_actions(action, kind)
+
+    def episode_batch(self, index: int) -> TaskBatch:
+        """Return environments in the states of an episode's steps; no other robot is read.
+
+        They cannot be stepped.
+        """
+        episode = self.episodes[index]
+        spec, steps = self.spec(episode.robot_index, episode.task), episode.frames
+        columns = {name: self.columns[name][steps.start : steps.stop] for name in _OBSERVED}
+        for name in _OBSERVED[:2]:  # without the joints of larger robots
+            columns[name] = columns[name][:, : spec.robot.dof]
+        links = default_max_links([len(spec.robot.links)])
+        batch = TaskBatch(
+            build_robot_tables([spec.robot], max_links=links),
+            [spec],
+            [0] * episode.length,
+            _RecordedStates([spec.scene] * episode.length, columns),
+        )
+        batch.reset(seed=[episode.seed] * episode.length)
+        return batch
 
 
 _OBSERVED = (

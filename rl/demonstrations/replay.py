@@ -64,7 +64,7 @@ def replay(demos: Demonstrations, episodes: Sequence[int]) -> Iterator[Replay]:
 def _replay(demos: Demonstrations, episode: RecordedEpisode) -> Replay:
     columns = {name: demos.columns[name][episode.first :][: episode.length] for name in _COMPARED}
     executed = demos.columns.get("executed_action", demos.columns["normalized_action"])
-    spec = demos.specs[episode.robot_index, episode.task]
+    spec = demos.spec(episode.robot_index, episode.task)
     dof, sim = spec.robot.dof, demos.settings["sim"]
     device = SIMULATORS[sim].devices[0]
     batch = batch_from_specs([spec], 1, sim=sim, device=device, workers=1)

@@ -23,6 +23,7 @@ PAGES: Mapping[str, str] = {
     "compare": "morphgen.viewer.pages.compare:show",
     "split": "morphgen.viewer.pages.split:show",
     "play": "morphgen.viewer.pages.play:show",
+    "demos": "morphgen.viewer.pages.demos:show",
 }
 """The function that builds each page, by the page's key in the address (``?robot=...``)."""
 

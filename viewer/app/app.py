@@ -19,6 +19,7 @@ from morphgen.formats.urdf.read import UnsoundError
 from morphgen.grammar.grammar_file import SUFFIX, grammar_names
 from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_source import is_robot_folder
+from morphgen.rl.demonstrations.lerobot import is_data_set
 from morphgen.splits.split_file import split_names
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import CHOSEN, Address, load_page, parse_address, parse_count
@@ -264,6 +265,11 @@ def _path_address(text: str, files: FileAccess) -> Address:
 
         read_checkpoint(path)
         return Address("play", state={"policy": text})
+    if is_data_set(path):
+        from morphgen.rl.demonstrations.reader import Demonstrations
+
+        Demonstrations(path)
+        return Address("demos", (text,))
     if path.is_file():
         return Address({".yaml": "split", SUFFIX: "compose"}.get(path.suffix, "robot"), (text,))
     if (path / SPLIT_FILE).is_file():

@@ -9,6 +9,7 @@ import viser
 
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.grammar.grammar_file import grammar_names
+from morphgen.rl.demonstrations.lerobot import RECORDING
 from morphgen.splits.split import SIDES
 from morphgen.splits.split_file import split_names
 from morphgen.viewer import markup
@@ -143,11 +144,12 @@ _TITLES = {
     "gallery": "Open the gallery of which robots?",
     "population": "Show which robots on one ground?",
     "split": "Open which split?",
+    "demos": "Play which demonstrations?",
 }
 
 
 def show_index(session: Session) -> None:
-    """Build the page that asks for the subject of a gallery, a population or a split."""
+    """Build the page that asks for the subject of another page, such as a gallery or a split."""
     page = session.address.page
     session.open_panel(INDEX_WIDTH, markup.breadcrumbs((page, None)), left=True)
     html = f"<h2>{_TITLES[page]}</h2>{section_links(session.files, page)}"
@@ -167,6 +169,12 @@ def section_links(files: FileAccess, page: str = "library") -> str:
         return f"<h3>{title}</h3>{text or markup.dim(empty)}"
 
     html = ""
+    if page in ("library", "demos"):
+        recorded = sorted(path.parent.name for path in root.glob(f"*/{RECORDING}"))
+        empty = "none yet: run <code>morphgen record</code>"
+        html += section("Demonstrations in this folder", recorded, ("demos",), empty)
+    if page == "demos":
+        return html
     if page != "split":
         empty = (
             "none yet: compose a robot and write it to robots/, or run "

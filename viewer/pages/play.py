@@ -61,7 +61,7 @@ def show(session: Session) -> None:
     if subject.endswith(EPISODE_SUFFIX):
         episode = read_episode(session.files.path(subject), session.files)
         page = PlayPage(session)
-        session.client.gui.add_html(markup.framed(_description(episode)))
+        session.client.gui.add_html(markup.framed(describe_episode(episode)))
         session.title = f"play {uri_name(subject)}"
         session.apply_state()
         page.load(lambda: EpisodeSource(episode, episode.num_steps))
@@ -125,10 +125,14 @@ class PlayPage:
         """Show the state in the address, and let the player show an episode."""
         self._position = None
         self.session.show_state()
-        if self._scene is not None:  # not the pose of another seed until the new start is there
-            self._scene.root.visible = False
         start, self._start = self._start, None
-        self.player.load(make_source, start=start)
+
+        def load() -> EpisodeSource:  # on the player's thread, which also removes scenes
+            if self._scene is not None:  # not the pose of another seed until the new start is there
+                self._scene.root.visible = False
+            return make_source()
+
+        self.player.load(load, start=start)
 
     def add_rollout_controls(self, trained_on: Robots) -> None:
         """Add the controls of a rollout in the state that the address gives, and start it."""
@@ -379,7 +383,7 @@ def score_table(episode: Episode, step: int) -> str:
     return head + markup.table(header, rows, (1, 2))
 
 
-def _description(episode: Episode) -> str:
+def describe_episode(episode: Episode) -> str:
     """Return a table about a recorded episode, with links to its robots."""
     rows = [
         ("task", escape(episode.task) + (" with obstacles" if episode.obstacles else "")),
@@ -403,9 +407,9 @@ _NOW = "#868e96"  # colour of the line at the current time
 
 
 def add_charts(gui: viser.GuiApi, episode: Episode, *, dark: bool) -> list[viser.GuiUplotHandle]:
-    """Add the charts of the distance to success and of the score, one below the other."""
+    """Add the charts of distance to success, score and, if recorded, reward below each other."""
     names = [track.robot.name for track in episode.tracks]
-    labels = (f"m from {TASKS[episode.task].target}", "score so far")
+    labels = (f"m from {TASKS[episode.task].target}", "score so far", "reward")
     plain = uplot.Series_Points(show=False)
     series = [
         uplot.Series(label="time (s)"),
@@ -424,19 +428,21 @@ def add_charts(gui: viser.GuiApi, episode: Episode, *, dark: bool) -> list[viser
             legend=uplot.Legend(show=label == "score so far" and len(names) > 1),
             height=_HEIGHT,
         )
-        for label, data in zip(labels, curves(episode, 0), strict=True)
+        for label, data in zip(labels, curves(episode, 0), strict=False)
     ]
 
 
-def curves(episode: Episode, step: int) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Return the data of the charts of distance and score: time, the robots' curves, and a line.
+def curves(episode: Episode, step: int) -> list[tuple[Array, ...]]:
+    """Return the data of the charts of distance, score and, if recorded, reward.
+
+    Each has the time, the robots' curves, and a line at the step.
 
     uPlot has no vertical lines; the line is a curve with three values at the step: low, high, low.
     Robots whose episode ended earlier keep their last value: uPlot draws no curve with NaN.
     """
     num_steps = max(episode.num_steps, 1)
     time = np.arange(1, num_steps + 1) * episode.period
-    distances, totals = [], []
+    distances, totals, rewards = [], [], []
     for track in episode.tracks:
         n = min(len(track.score), len(track.distance), num_steps)
         sums = zip(np.cumsum(track.score[:n]).tolist(), track.score[:n], strict=True)
@@ -444,6 +450,7 @@ def curves(episode: Episode, step: int) -> tuple[tuple[Array, ...], tuple[Array,
         values = [score(total, last, i) for i, (total, last) in enumerate(sums, 1)]
         distances.append(_padded(track.distance[:n], num_steps))
         totals.append(_padded(values, num_steps))
+        rewards += [_padded(track.reward, num_steps)] if track.reward else []
     now = min(max(step, 1), num_steps) - 1
     rows = np.insert(np.arange(num_steps), now, (now, now))
 
@@ -451,7 +458,7 @@ def curves(episode: Episode, step: int) -> tuple[tuple[Array, ...], tuple[Array,
         line = np.where(np.arange(len(rows)) == now + 1, np.max(values), np.min(values))
         return (*(curve[rows] for curve in (time, *values)), line)
 
-    return with_line(distances), with_line(totals)
+    return [with_line(values) for values in (distances, totals, rewards) if values]
 
 
 def _padded(values: list[float], length: int) -> Array:
