@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from numbers import Integral
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, overload
 
 from morphgen.arguments import checked_signature, path_argument, truth, whole_number
-from morphgen.benchmark.audit import Audit, audit, audit_goals, goals_to_audit, with_goal_findings
+from morphgen.benchmark.audit import Audit, audit_with_goals
 from morphgen.benchmark.generate import (
     SplitRequest,
     composition,
@@ -134,14 +134,15 @@ class LoadedSplit:
             BenchmarkError: If the provenance of the split is malformed.
             MissingDependencyError: If a part's primitives must be fitted, and ``fit`` is missing.
         """
-        split, library = self.definition, self.library
-        result = audit(split, library, near=near, jobs=jobs)
-        sample = partial(sample_split_goals, split, library, jobs=jobs) if goals else None
-        sets = goals_to_audit(self.folder, goal_seed, sample)
-        findings = None
-        if sets is not None:
-            findings = audit_goals(split, sets, library, jobs=jobs)
-        return with_goal_findings(result, split, findings)
+        return audit_with_goals(
+            self.definition,
+            self.library,
+            self.folder,
+            near=near,
+            goals=goals,
+            goal_seed=goal_seed,
+            jobs=jobs,
+        )
 
     def write(self, path: str | PathLike[str] = ".") -> Path:
         """Write the split's file.

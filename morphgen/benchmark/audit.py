@@ -15,8 +15,7 @@ it if the robots are the same.
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -27,13 +26,21 @@ from numpy.typing import NDArray
 from morphgen.benchmark.generate import parse_bound
 from morphgen.benchmark.hold_out import has_hold_out_rules, hold_out_findings
 from morphgen.benchmark.regimes import regime_findings
-from morphgen.benchmark.survey import Fault, SplitSurvey, SurveyedRobot, nearest_train, survey_split
+from morphgen.benchmark.survey import (
+    Fault,
+    NearestTrain,
+    SplitSurvey,
+    SurveyedRobot,
+    nearest_train,
+    survey_split,
+)
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.encoding.similarity import NEAR_THRESHOLDS, NearThresholds, is_same_reach
 from morphgen.errors import MorphgenError, nearest
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding, Severity
 from morphgen.processes import parallel_map
+from morphgen.progress import stage
 from morphgen.splits.split import SIDES, Member, Side, Split, sided_members
 from morphgen.tasks.goals.goal_sets import arrays_of
 from morphgen.tasks.goals.split_goals import (
@@ -42,6 +49,7 @@ from morphgen.tasks.goals.split_goals import (
     certify_goal_set,
     has_goals,
     read_split_goals,
+    sample_split_goals,
 )
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, member_with_primitives
@@ -72,17 +80,6 @@ _FIXES = {
 
 
 @dataclass(frozen=True)
-class Neighbour:
-    """The train robot that is most similar to a test robot by one measure."""
-
-    test: str
-    measure: str
-    """Name of the measure, a key of ``MEASURES``."""
-    train: str
-    value: float
-
-
-@dataclass(frozen=True)
 class Audit:
     """Result of an audit."""
 
@@ -90,8 +87,10 @@ class Audit:
     findings: tuple[Finding, ...]
     accepted: tuple[tuple[Finding, str], ...]
     """Findings that the split's author accepts, each with the reason."""
-    neighbours: tuple[Neighbour, ...]
-    """Nearest train robots by test robot, then measure, without robots that cannot be composed."""
+    nearest: Mapping[str, Mapping[str, NearestTrain]]
+    """Nearest train robot by test robot and measure, without robots that cannot be composed."""
+    goals: Mapping[str, int] | None = None
+    """Number of goal ``sets`` that were audited, and their ``seed``; None if there were none."""
 
     def passed(self, *, strict: bool = False) -> bool:
         """Return True if there are no unaccepted errors; ``strict``: and no warnings."""
@@ -101,15 +100,15 @@ class Audit:
     def as_dict(self) -> dict[str, object]:
         """Return plain data for JSON."""
         accepted = [{**finding.as_dict(), "reason": reason} for finding, reason in self.accepted]
-        nearest: dict[str, dict[str, object]] = defaultdict(dict)
-        for neighbour in self.neighbours:
-            entry = {"train": neighbour.train, "value": neighbour.value}
-            nearest[neighbour.test][neighbour.measure] = entry
         return {
             "split": self.split,
             "findings": [finding.as_dict() for finding in self.findings],
             "accepted": accepted,
-            "nearest": dict(nearest),
+            "nearest": {
+                test: {measure: vars(found) for measure, found in trains.items()}
+                for test, trains in self.nearest.items()
+            },
+            "goals": self.goals,
         }
 
 
@@ -149,13 +148,19 @@ def audit_survey(
         *_regime_findings(survey, library),
         *_bound_findings(survey),
     ]
-    return _conclude(split, findings, tuple(_neighbours(survey)))
+    n = len(split.train)
+    nearest = {
+        member.name: trains
+        for j, member in enumerate(split.test, n)
+        if (trains := nearest_train(split.train, survey.similarity[:n, j]))
+    }
+    return _conclude(split, findings, nearest)
 
 
 def _conclude(
     split: Split,
     findings: Sequence[Finding],
-    neighbours: tuple[Neighbour, ...],
+    nearest: Mapping[str, Mapping[str, NearestTrain]],
     not_audited: Collection[str] = (),
 ) -> Audit:
     """Return an audit from all findings: those that the split accepts are set apart.
@@ -175,7 +180,7 @@ def _conclude(
         split.name,
         (*remaining, *unused),
         tuple((finding, split.accepted[finding.code]) for finding in accepted),
-        neighbours,
+        nearest,
     )
 
 
@@ -277,13 +282,6 @@ def _bound_findings(survey: SplitSurvey) -> Iterator[Finding]:
             yield _finding("similarity-bound", "test", member.name, why)
 
 
-def _neighbours(survey: SplitSurvey) -> Iterator[Neighbour]:
-    n = len(survey.split.train)
-    for j, member in enumerate(survey.split.test, n):
-        for name, train, value in nearest_train(survey.split.train, survey.similarity[:n, j]):
-            yield Neighbour(member.name, name, train, value)
-
-
 def _robots(survey: SplitSurvey) -> Iterator[tuple[Side, Member, SurveyedRobot | Fault]]:
     for (side, member), robot in zip(sided_members(survey.split), survey.robots, strict=True):
         yield side, member, robot
@@ -309,19 +307,36 @@ NEAR_JOINT = 1e-3  # difference of every joint below which configurations are th
 MAX_SHARED = 0.5  # fraction of a set that two different robots may have in common
 
 
-def goals_to_audit(
-    folder: Path | None,
-    seed: int | None,
-    sample: Callable[[GoalConfig], Sequence[GoalResult]] | None,
-) -> SplitGoals | None:
-    """Return the goal sets that an audit of a split tests; None if it tests none."""
+def audit_with_goals(
+    split: Split,
+    library: Library,
+    folder: Path | None = None,
+    *,
+    near: NearThresholds = NEAR_THRESHOLDS,
+    goals: bool = False,
+    goal_seed: int | None = None,
+    jobs: int = 1,
+) -> Audit:
+    """Audit a split and the goal sets that its folder ships; see ``audit`` and ``audit_goals``.
+
+    goals: Whether to audit goal sets even if there are no shipped ones.
+    goal_seed: Seed that the goal sets must have; by default that of the shipped ones, or 0.
+    """
+    result, sets, findings = audit(split, library, near=near, jobs=jobs), None, None
     if folder is not None and has_goals(folder):
-        goals = read_split_goals(folder)
-        return goals if seed is None else replace(goals, config=replace(goals.config, seed=seed))
-    if sample is None:
-        return None
-    config = GoalConfig(seed or 0)
-    return SplitGoals.from_results(sample(config), config)
+        sets = read_split_goals(folder)
+        seed = sets.config.seed if goal_seed is None else goal_seed
+        sets = replace(sets, config=replace(sets.config, seed=seed))
+    elif goals:
+        config = GoalConfig(goal_seed or 0)
+        with stage("sampling goals"):
+            sampled = sample_split_goals(split, library, config, jobs=jobs)
+        sets = SplitGoals.from_results(sampled, config)
+    if sets is not None:
+        with stage("auditing goals"):
+            findings = audit_goals(split, sets, library, jobs=jobs)
+        result = replace(result, goals={"sets": len(sets.sets), "seed": sets.config.seed})
+    return with_goal_findings(result, split, findings)
 
 
 def audit_goals(
@@ -362,7 +377,8 @@ def with_goal_findings(audit: Audit, split: Split, findings: Sequence[Finding] |
             found.append(_finding("task-unknown", side, member.name, reason))
     goal_codes = [code for code in _FIXES if code.startswith(("goals-", "task-"))]
     not_audited = goal_codes if findings is None else ()
-    return _conclude(split, [*found, *(findings or ())], audit.neighbours, not_audited)
+    joined = _conclude(split, [*found, *(findings or ())], audit.nearest, not_audited)
+    return replace(joined, goals=audit.goals)
 
 
 @dataclass(frozen=True)

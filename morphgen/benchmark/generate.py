@@ -9,16 +9,13 @@ import itertools
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from morphgen.benchmark.regimes import (
     HULLS,
-    NOTHING,
     RuledRobot,
-    combination,
-    parts,
     pattern_robots,
     regime_violations,
 )
@@ -323,47 +320,37 @@ def composition(
             f"--train {request.train[0]}: {shortest} robots at least are needed so that every part "
             f"of the test robots is trained, such as {names}"
         )
-    members = [*train[: request.train[-1] if request.train else None], *test]
-    unique = {candidate.text: candidate.recipe for candidate in members}
+    train = train[: request.train[-1] if request.train else None]
+    recipes = {
+        each.name: DerivedRecipe(each.derivation, each.name, each.category)
+        for each in (*train, *test)
+    }
     factory = RobotFactory(library, with_features=True, max_links=request.max_links)
-    composed_robots = parallel_map(factory, list(unique.values()), jobs)
-    robot_of = dict(zip(unique, composed_robots, strict=True))
-    _require_no_near(members[-len(test) :], members[: -len(test)], robot_of)
-    robots = []
-    for candidate in members:
-        robot = robot_of[candidate.text]
-        name = f"{candidate.name}-{candidate.task}" if len(request.tasks) > 1 else candidate.name
-        task = (candidate.task, request.obstacles)
-        robots.append(Member(name, robot.category, str(robot.derivation), *task, robot.hash))
+    robot_of = dict(zip(recipes, parallel_map(factory, list(recipes.values()), jobs), strict=True))
+    for each in test:  # as the audit does
+        others = [robot_of[other.name] for other in train if other.task == each.task]
+        if reason := _near_reason(robot_of[each.name], others):
+            raise BenchmarkError(
+                f"test robot {each.name}: has {reason}, a train robot; leave one of them out of "
+                "--from, or name another --seed"
+            )
+    sides = (
+        [robot_of[each.name].member(each.task, request.tasks, request.obstacles) for each in side]
+        for side in (train, test)
+    )
     kinds = len({candidate.combination for candidate in candidates})
     return assemble(
         request,
         "composition",
         f"{{n}} robots out of {kinds} combinations; test: {request.test} of combinations unseen",
-        robots[: -len(test)],
-        robots[-len(test) :],
+        *sides,
         {"from": list(patterns), "tasks": list(request.tasks)},
     )
 
 
-def _require_no_near(
-    test: Sequence[HoldOutCandidate],
-    train: Sequence[HoldOutCandidate],
-    robot_of: Mapping[str, Candidate],
-) -> None:
-    """Require that no test robot is nearly a train robot of its task, as the audit does."""
-    for each in test:
-        others = [robot_of[other.text] for other in train if other.task == each.task]
-        if reason := _near_reason(robot_of[each.text], others):
-            raise BenchmarkError(
-                f"test robot {each.name}: has {reason}, a train robot; leave one of them out of "
-                "--from, or name another --seed"
-            )
-
-
 def _candidates(
     patterns: Sequence[str], tasks: Sequence[str], library: Library
-) -> Iterator[HoldOutCandidate]:
+) -> Iterator[RuledRobot]:
     """Yield every robot of the patterns once for each task."""
     name_by_derivation: dict[str, str] = {}
     for robot in itertools.chain.from_iterable(pattern_robots(p, library) for p in patterns):
@@ -373,33 +360,13 @@ def _candidates(
         if name in name_by_derivation.values():
             name = f"{name}-{derivation.digest[:8]}"
         name_by_derivation[str(derivation)] = name
-        *_, last = (node.part for node in derivation.walk() if node.part != NOTHING)
-        properties = (str(derivation), combination(derivation), parts(derivation), last)
         for task in tasks:
-            yield HoldOutCandidate(name, replace(robot.recipe, name=name), *properties, task)
-
-
-@dataclass(frozen=True)
-class HoldOutCandidate:
-    """A robot with a task, which may become a train or a test member."""
-
-    name: str
-    recipe: DerivedRecipe
-    text: str  # derivation of the robot
-    combination: str  # parts and ports, see `regimes.combination`
-    parts: frozenset[str]
-    outermost: str  # last part of the robot, usually the end-effector
-    task: str
-
-    @property
-    def covers(self) -> set[str]:
-        """The parts and the task that training with this robot covers."""
-        return {*self.parts, f"task {self.task}"}
+            yield RuledRobot(name, robot.recipe.category, task, derivation, library)
 
 
 def hold_out_combinations(
-    candidates: Sequence[HoldOutCandidate], n: int, min_train: int, seed: np.random.SeedSequence
-) -> tuple[list[HoldOutCandidate], list[HoldOutCandidate]]:
+    candidates: Sequence[RuledRobot], n: int, min_train: int, seed: np.random.SeedSequence
+) -> tuple[list[RuledRobot], list[RuledRobot]]:
     """Choose test candidates of as many combinations as possible; return them and train candidates.
 
     Candidates with the combination of a test candidate are excluded from training, for all tasks.
@@ -418,11 +385,11 @@ def hold_out_combinations(
 
 
 def _hold_out_in_order(
-    order: Sequence[HoldOutCandidate], n: int, min_train: int
-) -> tuple[list[HoldOutCandidate], list[HoldOutCandidate]]:
+    order: Sequence[RuledRobot], n: int, min_train: int
+) -> tuple[list[RuledRobot], list[RuledRobot]]:
     """Hold out each candidate in turn whose parts the rest still covers, new combinations first."""
     is_mixed = len({candidate.task for candidate in order}) > 1
-    test: list[HoldOutCandidate] = []
+    test: list[RuledRobot] = []
     train = list(order)
     needed: set[str] = set()
     for fresh in (True, False):
@@ -443,7 +410,7 @@ def _hold_out_in_order(
     return test, train
 
 
-def num_covering(candidates: Sequence[HoldOutCandidate], test: Sequence[HoldOutCandidate]) -> int:
+def num_covering(candidates: Sequence[RuledRobot], test: Sequence[RuledRobot]) -> int:
     """Return how many of the first candidates cover each part and task of the test ones."""
     needed = {item for candidate in test for item in candidate.covers}
     n = 0
@@ -453,11 +420,9 @@ def num_covering(candidates: Sequence[HoldOutCandidate], test: Sequence[HoldOutC
     return n
 
 
-def _covering_first(
-    candidates: Sequence[HoldOutCandidate], needed: set[str]
-) -> list[HoldOutCandidate]:
+def _covering_first(candidates: Sequence[RuledRobot], needed: set[str]) -> list[RuledRobot]:
     """Move candidates that cover all that is needed to the front (greedy set cover)."""
-    first: list[HoldOutCandidate] = []
+    first: list[RuledRobot] = []
     rest = list(candidates)
     missing = set(needed)
     while missing:
@@ -468,7 +433,7 @@ def _covering_first(
     return first + rest
 
 
-def _why_not(candidates: Sequence[HoldOutCandidate], n: int, min_train: int, max_held: int) -> str:
+def _why_not(candidates: Sequence[RuledRobot], n: int, min_train: int, max_held: int) -> str:
     combinations = {candidate.combination: candidate.parts for candidate in candidates}
     counts = Counter(part for parts in combinations.values() for part in parts)
     alone = sorted(part for part, times in counts.items() if times == 1)

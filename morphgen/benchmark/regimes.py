@@ -9,7 +9,7 @@ import itertools
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from functools import cached_property
 
@@ -215,7 +215,7 @@ class RuledRobot:
     category: str
     task: str
     derivation: Derivation
-    library: Library
+    library: Library = field(repr=False, compare=False)
 
     @classmethod
     def of(cls, robot: Member | Candidate, library: Library) -> RuledRobot:
@@ -239,6 +239,17 @@ class RuledRobot:
     def parts(self) -> frozenset[str]:
         """See ``parts``."""
         return parts(self.derivation)
+
+    @property
+    def outermost(self) -> str:
+        """The last part of the robot, usually the end-effector."""
+        *_, last = (node.part for node in self.derivation.walk() if node.part != NOTHING)
+        return last
+
+    @cached_property
+    def covers(self) -> frozenset[str]:
+        """The parts and the task that training with this robot covers."""
+        return self.parts | {f"task {self.task}"}
 
     @cached_property
     def parameters(self) -> list[float]:

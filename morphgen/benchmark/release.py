@@ -568,12 +568,13 @@ def _release(split: Split, request: ReleaseRequest, difficulty: Mapping[str, Any
 
 def _difficulty_data(survey: SplitSurvey, audited: Audit) -> dict[str, Any]:
     """Return the similarity of test and train robots as JSON data."""
-    nearest: dict[str, dict[str, object]] = {}
-    for neighbour in audited.neighbours:
-        nearest.setdefault(neighbour.test, {})[neighbour.measure] = {
-            "train": neighbour.train,
-            "value": round(neighbour.value, DIGITS),
+    nearest = {
+        test: {
+            measure: {"train": found.train, "value": round(found.value, DIGITS)}
+            for measure, found in trains.items()
         }
+        for test, trains in audited.nearest.items()
+    }
     return {"cosine": summarize_survey(survey)["cosine"], "nearest": nearest}
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from typing import Any, Literal, TypeAlias
 
@@ -283,7 +283,7 @@ class NearestTrain:
     """The train robot that is most similar to a robot by one measure."""
 
     train: str  # name of the train robot
-    value: float  # value of the measure, rounded to `DIFFICULTY_DIGITS`
+    value: float  # value of the measure
 
 
 @dataclass(frozen=True)
@@ -312,7 +312,8 @@ class RobotDifficulty:
     links: int
     reach: float  # largest distance of the tool from the root's origin [m]
     nearest: Mapping[str, NearestTrain]
-    """Nearest train robot by the name of the measure; empty if there is no other train robot."""
+    """Nearest train robot by the name of the measure, with its value rounded to
+    ``DIFFICULTY_DIGITS``; empty if there is no other train robot."""
     baselines: Mapping[str, BaselineResult] = field(default_factory=dict)
     """Results of baselines by name, without those that cannot do the task."""
 
@@ -369,7 +370,7 @@ def _rows(survey: SplitSurvey, results: BaselineResults) -> Iterator[RobotDiffic
             robot.stats.movable_to_tool,
             robot.stats.links,
             _rounded(robot.stats.reach),
-            {name: NearestTrain(train, _rounded(value)) for name, train, value in nearest},
+            {name: replace(found, value=_rounded(found.value)) for name, found in nearest.items()},
             baselines,
         )
 
@@ -387,15 +388,16 @@ def train_similarity(survey: SplitSurvey, index: int) -> Array:
     return np.where(is_other[:, None], similarity, np.nan)
 
 
-def nearest_train(train: Sequence[Member], similarity: Array) -> Iterator[tuple[str, str, float]]:
-    """Yield each measure, the train robot that is nearest by it, and its similarity.
+def nearest_train(train: Sequence[Member], similarity: Array) -> dict[str, NearestTrain]:
+    """Return the train robot that is nearest by each measure, if there is one to compare with.
 
     similarity: Similarity to the train robots, shape (n_train, n_measures).
     """
-    for name, values in zip(MEASURES, similarity.T, strict=True):
-        best = most_alike(values, name)
-        if best is not None:
-            yield name, train[best].name, float(values[best])
+    return {
+        name: NearestTrain(train[best].name, float(values[best]))
+        for name, values in zip(MEASURES, similarity.T, strict=True)
+        if (best := most_alike(values, name)) is not None
+    }
 
 
 def _rounded(value: float) -> float:

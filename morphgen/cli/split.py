@@ -5,16 +5,14 @@ from __future__ import annotations
 import argparse
 import itertools
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 from morphgen.api.goals import goals as sample_goals
 from morphgen.api.splits import DEFAULT_TRAIN, NewSplit
-from morphgen.api.splits import split as choose
+from morphgen.api.splits import split as open_split
 from morphgen.benchmark import release as releases
-from morphgen.benchmark.audit import Audit, audit_goals, goals_to_audit, with_goal_findings
-from morphgen.benchmark.audit import audit as audit_robots
+from morphgen.benchmark.audit import Audit
 from morphgen.benchmark.hold_out import related_parts
 from morphgen.benchmark.licences import (
     licenced_parts,
@@ -46,11 +44,7 @@ from morphgen.rl.baselines import BASELINES
 from morphgen.splits.split import HOLD_OUT, SIDES, Split, split_id
 from morphgen.splits.split_file import read_split, split_names, split_paths, write_new_splits
 from morphgen.tables import table
-from morphgen.tasks.goals.split_goals import (
-    GoalResult,
-    SplitGoals,
-    sample_split_goals,
-)
+from morphgen.tasks.goals.split_goals import GoalResult, sample_split_goals
 from morphgen.tasks.scenes.env_specs import GoalConfig
 
 
@@ -62,39 +56,23 @@ def goals(args: argparse.Namespace) -> int:
     return int(not sets.passed)
 
 
-def make_goals(args: argparse.Namespace, split: Split, config: GoalConfig) -> list[GoalResult]:
-    """Sample the goal sets of a split's robots, or read them from the cache."""
-    with bar(args, "sampling goals"):
-        return sample_split_goals(split, opt.library_of(args), config, jobs=args.jobs)
-
-
 MAX_LISTED = 10
 """Largest number of findings of one code, or of differences, that are printed."""
 
 
 def audit(args: argparse.Namespace) -> int:
     """Audit a split and print the findings."""
-    near = _near(args.near)
-    split, folder = read_split_or_folder(args.split)
-    library = opt.library_of(args)
+    near, split = _near(args.near), open_split(args.split, library=args.library)
     with bar(args, "auditing"):
-        result = audit_robots(split, library, near=near, jobs=args.jobs)
-    sample = partial(make_goals, args, split) if args.goals else None
-    goals, findings = goals_to_audit(folder, args.goal_seed, sample), None
-    if goals is not None:
-        with bar(args, "auditing goals"):
-            findings = audit_goals(split, goals, library, jobs=args.jobs)
-    result = with_goal_findings(result, split, findings)
+        result = split.audit(near=near, goals=args.goals, goal_seed=args.goal_seed, jobs=args.jobs)
     passed = result.passed(strict=args.strict)
-    sets = {"sets": len(goals.sets), "seed": goals.config.seed} if goals else None
     try:
-        parts = licenced_parts(split, library)
+        parts = split.licences()
     except (GrammarError, PartError):  # the audit has a finding about it
         parts = ()
     limited = [part.as_dict() for part in restricted(parts)]
-    data = {**result.as_dict(), "goals": sets, "restricted": limited, "passed": passed}
-    line = restriction_line(parts)
-    opt.print_result(args, data, lambda: _audit_text(result, passed, goals, line))
+    data = {**result.as_dict(), "restricted": limited, "passed": passed}
+    opt.print_result(args, data, lambda: _audit_text(result, passed, restriction_line(parts)))
     return int(not passed)
 
 
@@ -117,12 +95,11 @@ def _near(text: str | None) -> NearThresholds:
     return near
 
 
-def _audit_text(result: Audit, passed: bool, goals: SplitGoals | None, limits: str) -> str:
-    nearest: dict[str, list[str]] = {}
-    for neighbour in result.neighbours:
-        cell = f"{neighbour.train} {neighbour.value:.3f}"
-        nearest.setdefault(neighbour.test, []).append(cell)
-    rows = [(test, *cells) for test, cells in nearest.items()]
+def _audit_text(result: Audit, passed: bool, limits: str) -> str:
+    rows = [
+        (test, *(f"{found.train} {found.value:.3f}" for found in trains.values()))
+        for test, trains in result.nearest.items()
+    ]
     headers = ("test robot", *(f"nearest by {name}" for name in MEASURES))
     lines = [table(rows, headers)] if rows else []
     reasons = {finding.code: reason for finding, reason in result.accepted}
@@ -132,8 +109,8 @@ def _audit_text(result: Audit, passed: bool, goals: SplitGoals | None, limits: s
     for code, findings in _by_code([finding for finding, _ in result.accepted]).items():
         lines.append(f"accepted {code} ({len(findings)}): {reasons[code]}")
         lines += _listed(findings)
-    if goals:
-        lines.append(f"{len(goals.sets)} goal sets were audited, seed {goals.config.seed}")
+    if result.goals:
+        lines.append("{sets} goal sets were audited, seed {seed}".format_map(result.goals))
     if limits:
         lines.append(limits)
     counts = opt.severity_counts(result.findings, ("error", "warning"))
@@ -159,8 +136,10 @@ def build(args: argparse.Namespace) -> None:
     """Build a split and print where it is."""
     settings = BuildSettings(light=args.light, picture=args.picture)
     split, config = read_split(args.split), GoalConfig(args.goal_seed or 0)
-    goals = make_goals(args, split, config) if args.goals else []
-    library = opt.library_of(args)
+    library, goals = opt.library_of(args), list[GoalResult]()
+    if args.goals:
+        with bar(args, "sampling goals"):
+            goals = sample_split_goals(split, library, config, jobs=args.jobs)
     with bar(args, "building"):
         report = build_with_goals(split, args.out, library, settings, goals, config, jobs=args.jobs)
     written, kept = report.num_written, report.num_kept
@@ -332,7 +311,7 @@ def new(args: argparse.Namespace) -> None:
     # Smaller splits are parts of the largest.
     total = train[-1] + args.test if train else None
     with bar(args, "sampling", total=total):
-        loaded = choose(args.name or "", train=train, library=args.library, **choice)
+        loaded = open_split(args.name or "", train=train, library=args.library, **choice)
     splits = [each.definition for each in loaded]
     paths = split_paths(args.out, splits)
     write_new_splits(splits, paths)

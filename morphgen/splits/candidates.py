@@ -81,6 +81,17 @@ class Candidate:
     features: Features | None = None
     """Features for similarity measures; None if the factory does not compute them."""
 
+    def member(self, task: str, tasks: Sequence[str], obstacles: bool) -> Member:
+        """Return the member of a split with these tasks; of several, its name ends in its own."""
+        return Member(
+            self.name if len(tasks) == 1 else f"{self.name}-{task}",
+            self.category,
+            str(self.derivation),
+            task,
+            obstacles,
+            self.hash,
+        )
+
 
 @dataclass(frozen=True)
 class RobotFactory:
@@ -134,16 +145,5 @@ def numbered_name(prefix: str, number: int) -> str:
 def members(
     candidates: Iterable[Candidate], tasks: Sequence[str], obstacles: bool
 ) -> tuple[Member, ...]:
-    """Return a member for each robot and task; with several tasks the name ends in the task."""
-    return tuple(
-        Member(
-            robot.name if len(tasks) == 1 else f"{robot.name}-{task}",
-            robot.category,
-            str(robot.derivation),
-            task,
-            obstacles,
-            robot.hash,
-        )
-        for robot in candidates
-        for task in tasks
-    )
+    """Return a member for each robot and task."""
+    return tuple(robot.member(task, tasks, obstacles) for robot in candidates for task in tasks)

@@ -132,11 +132,11 @@ def test_an_unknown_part_is_reported_with_the_nearest():
     (missing,) = report.findings
     assert (missing.code, missing.where) == ("part-missing", "train robot planar-cube")
     assert "no part 'cubw'; did you mean 'cube" in missing.why
-    trained = {n.train for n in report.neighbours}
+    trained = {found.train for trains in report.nearest.values() for found in trains.values()}
     assert trained <= {"gantry-plane", "gantry-cylinder", "planar-stick"}
     wrong = replace(member(TEST[0]), derivation="base=planar[top: ee=cubw]")
     report = audit(combined(test=[wrong]), LIBRARY)
-    assert ([each.code for each in report.findings], report.neighbours) == (["part-missing"], ())
+    assert ([each.code for each in report.findings], report.nearest) == (["part-missing"], {})
     wrong = [replace(member(words), derivation="base=nothing") for words in TRAIN]
     assert {code for code, _ in finding_keys(combined(train=wrong))} == {"part-missing"}
 

@@ -9,14 +9,13 @@ from hypothesis import strategies as st
 
 from helpers.generated_splits import LIBRARY, derivations, names, order, require_sound
 from morphgen.benchmark.generate import (
-    HoldOutCandidate,
     composition,
     hold_out_combinations,
     num_covering,
 )
-from morphgen.benchmark.regimes import expand, parts, regime_findings, structure
+from morphgen.benchmark.regimes import RuledRobot, expand, parts, regime_findings, structure
 from morphgen.errors import BenchmarkError, CompositionError, PartError
-from morphgen.grammar.derivation import parse_derivation
+from morphgen.grammar.derivation import Derivation, parse_derivation
 
 pytestmark = pytest.mark.usefixtures("composed_once")
 
@@ -122,8 +121,9 @@ def test_impossible_compositions_are_errors_with_the_reason(asked, patterns, err
 
 
 def cell(arm, ee, task="reach", k=""):
-    parts = frozenset((arm, ee))
-    return HoldOutCandidate(f"{arm}-{ee}", (), f"{arm}({ee}{k})", f"{arm}[{ee}]", parts, ee, task)
+    values = (("k", float(k)),) if k != "" else ()
+    derivation = Derivation("arm", arm, (), (("flange", Derivation("ee", ee, values)),))
+    return RuledRobot(f"{arm}-{ee}", "composed", task, derivation, LIBRARY)
 
 
 def chosen(cells, n=1, left=1, seed=0):

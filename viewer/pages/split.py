@@ -108,11 +108,12 @@ def audit_text(audit: Audit) -> str:
             for finding, reason in audit.accepted
         ]
         text += "<h3>Accepted</h3>" + markup.table(("code", "where", "why"), rows)
-    neighbours = [
-        (escape(pair.test), pair.measure, escape(pair.train), f"{pair.value:.3f}")
-        for pair in audit.neighbours
+    nearest = [
+        (escape(test), measure, escape(found.train), f"{found.value:.3f}")
+        for test, trains in audit.nearest.items()
+        for measure, found in trains.items()
     ]
-    table = markup.table(("test", "measure", "train", ""), neighbours, (3,))
+    table = markup.table(("test", "measure", "train", ""), nearest, (3,))
     return f"{text}<h3>Nearest train robots</h3>{table}"
 
 
