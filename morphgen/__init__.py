@@ -19,9 +19,8 @@ if TYPE_CHECKING:
     from morphgen.api.environments import make_env
     from morphgen.api.evaluation import evaluate, play
     from morphgen.api.export import export
-    from morphgen.api.goals import goals
     from morphgen.api.robots import compose, fit, read, sample, write
-    from morphgen.api.splits import split
+    from morphgen.api.splits import goals, split
     from morphgen.api.training import train
     from morphgen.errors import MorphgenError
     from morphgen.model.robot import Robot
@@ -67,7 +66,7 @@ _MODULES = {
     "export": "morphgen.api.export",
     "fit": "morphgen.api.robots",
     "fix": "morphgen.api.checks",
-    "goals": "morphgen.api.goals",
+    "goals": "morphgen.api.splits",
     "make_env": "morphgen.api.environments",
     "play": "morphgen.api.evaluation",
     "read": "morphgen.api.robots",

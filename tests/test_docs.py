@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from helpers.outside_robots import add_outside_robots
-from morphgen.benchmark.eval_protocol import EvalProtocol
+from morphgen.benchmark.scores.submission import EvalProtocol
 from morphgen.cli import build_parser, main
 from morphgen.cli.command import parse
 from morphgen.grammar.library import default_library

@@ -14,11 +14,12 @@ from typing import Any
 
 from morphgen.api.training import named_source, with_goal
 from morphgen.arguments import checked_signature, path_argument, require_types, text_argument
-from morphgen.benchmark.eval_protocol import EvalProtocol, protocol_from
 from morphgen.benchmark.release import is_release, read_release
 from morphgen.benchmark.scores.submission import (
+    EvalProtocol,
     Training,
     make_submission,
+    protocol_from,
     require_rules,
     submission_text,
 )

@@ -5,20 +5,18 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
-from string import Template
+from pathlib import Path
 from typing import Any
 
-import yaml
-
-from morphgen.benchmark.licences import LicencedPart, find_licence, licence_ids
-from morphgen.benchmark.release import (
+from morphgen.benchmark.licences import (
     CROISSANT_FILE,
-    LICENCES_FILE,
-    LICENCES_TEXT,
-    licence_summary,
-    licences_json,
-    licences_text,
+    LicencedPart,
+    croissant_contents,
+    croissant_head,
+    dataset_card,
+    find_licence,
+    licence_addresses,
+    licence_files,
 )
 from morphgen.benchmark.split_folder import README_FILE, SUMS_FILE, read_sums, sums_text
 from morphgen.benchmark.texts import read_text
@@ -26,7 +24,7 @@ from morphgen.files import write_atomic
 from morphgen.formats.bundle import CARD
 from morphgen.formats.data_files import read_json
 from morphgen.formats.files import folder_hashes
-from morphgen.rl.demonstrations.lerobot import BODIES, INDEX, INFO, RECORDING, STATS, read_index
+from morphgen.rl.demonstrations.lerobot import BODIES, INFO, RECORDING, read_index
 from morphgen.rl.demonstrations.reader import Demonstrations
 from morphgen.rl.demonstrations.replay import Replay
 from morphgen.rl.scores import Interval, success_interval
@@ -108,8 +106,7 @@ def describe(demos: Demonstrations) -> None:
         return
     parts = _licenced_parts(folder)
     texts = {
-        LICENCES_FILE: licences_json(parts),
-        LICENCES_TEXT: licences_text(parts),
+        **licence_files(parts),
         README_FILE: _card(demos, parts),
     }
     for name, text in texts.items():
@@ -135,21 +132,22 @@ def _licenced_parts(folder: Path) -> tuple[LicencedPart, ...]:
 
 def _card(demos: Demonstrations, parts: Sequence[LicencedPart]) -> str:
     """Return the dataset card, with the front matter that Hugging Face and LeRobot read."""
-    settings = demos.settings
-    ids = list(dict.fromkeys(find_licence(each).hub_id for each in licence_ids(parts)))
+    settings, name = demos.settings, demos.folder.resolve().name
     tasks = [each.task for each in summarize(demos)]
     data_files = [{"split": "train", "path": "data/*/*.parquet"}]
     front = {
-        "pretty_name": demos.folder.resolve().name,
-        "license": ids[0] if len(ids) == 1 else ids,
         "task_categories": ["robotics"],
         "tags": ["LeRobot", "morphgen", "cross-embodiment", "croissant", *tasks],
         "configs": [{"config_name": "default", "data_files": data_files}],
     }
     noise = f"`executed_action` is what the robot did, with noise of {settings['noise']:g}."
-    text = Template(read_text("demonstrations_card.md")).substitute(
-        name=front["pretty_name"],
-        folder=front["pretty_name"],
+    return dataset_card(
+        name,
+        parts,
+        front,
+        read_text("demonstrations_card.md"),
+        name=name,
+        folder=name,
         episodes=f"{len(demos.episodes):,}",
         robots=f"{len(demos.robot_hashes):,}",
         steps=f"{len(demos):,}",
@@ -160,17 +158,14 @@ def _card(demos: Demonstrations, parts: Sequence[LicencedPart]) -> str:
         noise=noise
         if settings["noise"]
         else "`normalized_action` its fractions of the largest steps.",
-        licences=licence_summary(parts),
     )
-    head: str = yaml.safe_dump(front, sort_keys=False, allow_unicode=True, width=10_000)
-    return f"---\n{head}---\n\n{text}"
 
 
 def _croissant(
     demos: Demonstrations, parts: Sequence[LicencedPart], sums: Mapping[str, str]
 ) -> str:
     """Return the text of ``croissant.json``, with the provenance of the data in terms of PROV-O."""
-    data: dict[str, Any] = json.loads(read_text(CROISSANT_FILE))
+    data = croissant_head() | croissant_contents("demonstrations_croissant.json", sums)
     data["@context"] |= {"prov": "http://www.w3.org/ns/prov#"}
     info, settings = read_json(demos.folder / INFO), demos.settings
     name = demos.folder.resolve().name
@@ -179,7 +174,7 @@ def _croissant(
         "description": f"{len(demos.episodes)} episodes of {len(demos.robot_hashes)} robots with "
         "the robots that they show, for cross-embodiment imitation learning",
         "version": "1.0.0",
-        "license": [find_licence(each).url or each for each in licence_ids(parts)],
+        "license": licence_addresses(parts),
         "citeAs": f"{name}: demonstrations recorded with morphgen {settings['morphgen']}",
         "prov:wasGeneratedBy": {
             "@type": "prov:Activity",
@@ -196,76 +191,34 @@ def _croissant(
             if (source := " ".join(each.citation.split()))
         ],
     }
-    files = {
-        INFO: ("application/json", "Features and sizes, as LeRobot reads them"),
-        STATS: ("application/json", "Statistics of the features"),
-        INDEX: ("application/jsonlines", "A line per robot"),
-        RECORDING: ("application/json", "Robots, policies, seeds and constants of the tasks"),
-        LICENCES_FILE: ("application/json", "Every part with its licence, source and robots"),
-    }
-    sets = {
-        "steps": ("application/x-parquet", "data/*/*.parquet", "Steps of all episodes"),
-        "episodes": ("application/x-parquet", "meta/episodes/*/*.parquet", "Episodes"),
-        "urdf": ("application/xml", f"{BODIES}/*/robot.urdf", "The URDF of every robot"),
-        "mjcf": ("application/xml", f"{BODIES}/*/robot.xml", "The MJCF of every robot"),
-        "videos": ("video/mp4", "videos/*/*/*.mp4", "Videos of the cameras, by feature"),
-        "goals": ("application/x-npz", f"{BODIES}/*/goals/*.npz", "Certified goals"),
-    }
-    data["distribution"] = [
+    data["recordSet"].append(
         {
-            **_named("cr:FileObject", file, about),
-            "contentUrl": file,
-            "encodingFormat": kind,
-            "sha256": sums[file],
+            "@type": "cr:RecordSet",
+            "@id": "steps",
+            "name": "steps",
+            "field": [
+                _field(column, feature)
+                for column, feature in info["features"].items()
+                if feature["dtype"] != "video"
+            ],
         }
-        for file, (kind, about) in files.items()
-    ] + [
-        {**_named("cr:FileSet", f"{key}-files", about), "encodingFormat": kind, "includes": glob}
-        for key, (kind, glob, about) in sets.items()
-        if any(PurePosixPath(name).match(glob) for name in sums)
-    ]
-    steps = {name: each for name, each in info["features"].items() if each["dtype"] != "video"}
-    episodes = ("episode_index", "robot_hash", "task", "policy", "seed", "success", "length")
-    data["recordSet"] = [
-        _records("robots", {"fileObject": {"@id": INDEX}}, read_index(demos.folder)[0]),
-        _records(
-            "episodes",
-            {"fileSet": {"@id": "episodes-files"}},
-            {
-                key: getattr(demos.episodes[0], key.replace("episode_index", "index"))
-                for key in episodes
-            },
-        ),
-        _records("steps", {"fileSet": {"@id": "steps-files"}}, steps),
-    ]
+    )
     return json.dumps(data, indent=2, ensure_ascii=False) + "\n"
 
 
-def _named(kind: str, name: str, about: str) -> dict[str, Any]:
-    return {"@type": kind, "@id": name, "name": name, "description": about}
+def _field(column: str, feature: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the field of a feature of LeRobot."""
+    field: dict[str, Any] = {
+        "@type": "cr:Field",
+        "@id": f"steps/{column}",
+        "name": f"steps/{column}",
+        "description": column,
+        "dataType": _DATA_TYPES[feature["dtype"]],
+        "source": {"fileSet": {"@id": "steps-files"}, "extract": {"column": column}},
+    }
+    if feature["names"] is not None:
+        field |= {"isArray": True, "arrayShape": str(feature["shape"][0])}
+    return field
 
 
-def _records(name: str, source: Mapping[str, Any], columns: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record set; the values of its columns are examples, or features of LeRobot."""
-    fields = []
-    for column, value in columns.items():
-        dtype = value["dtype"] if isinstance(value, dict) else type(value).__name__
-        field = {
-            **_named("cr:Field", f"{name}/{column}", column),
-            "dataType": _DATA_TYPES[dtype],
-            "source": {**source, "extract": {"column": column}},
-        }
-        if isinstance(value, dict) and value["names"] is not None:
-            field |= {"isArray": True, "arrayShape": str(value["shape"][0])}
-        elif isinstance(value, list):
-            field |= {"isArray": True, "arrayShape": "-1"}
-        fields.append(field)
-    return {"@type": "cr:RecordSet", "@id": name, "name": name, "field": fields}
-
-
-_DATA_TYPES = {
-    **dict.fromkeys(("float32", "float"), "sc:Float"),
-    **dict.fromkeys(("int64", "int"), "sc:Integer"),
-    "bool": "sc:Boolean",
-    **dict.fromkeys(("str", "list"), "sc:Text"),
-}
+_DATA_TYPES = {"float32": "sc:Float", "int64": "sc:Integer", "bool": "sc:Boolean"}

@@ -334,7 +334,7 @@ def composition(
                 f"test robot {each.name}: has {reason}, a train robot; leave one of them out of "
                 "--from, or name another --seed"
             )
-    sides = (
+    first, second = (
         [robot_of[each.name].member(each.task, request.tasks, request.obstacles) for each in side]
         for side in (train, test)
     )
@@ -343,7 +343,8 @@ def composition(
         request,
         "composition",
         f"{{n}} robots out of {kinds} combinations; test: {request.test} of combinations unseen",
-        *sides,
+        first,
+        second,
         {"from": list(patterns), "tasks": list(request.tasks)},
     )
 

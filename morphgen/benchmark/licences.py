@@ -1,10 +1,16 @@
-"""The licences of a split's parts, which of them restrict use, and in which robots they are."""
+"""The licences of parts, which of them restrict use, and how data sets state them.
+
+Releases of splits and demonstrations have a card, the licences of all parts, and Croissant.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+import json
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from pathlib import PurePosixPath
+from string import Template
 from typing import Any
 
 import yaml
@@ -15,6 +21,9 @@ from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.splits.split import SIDES, Split, sided_members
+
+LICENCES_FILE, LICENCES_TEXT = "licences.json", "LICENCES.md"
+CROISSANT_FILE = "croissant.json"
 
 UNKNOWN = "unknown"  # restriction of a licence that is not listed
 _SPDX = "https://spdx.org/licenses/{}.html"
@@ -151,3 +160,96 @@ def require_allowed(split: Split, parts: Iterable[LicencedPart], allowed: Collec
             f"{split.name}: {'; '.join(map(restriction_text, refused))}; release a split without "
             f"these parts, or allow the licence with --licence-allow {wanted}"
         )
+
+
+def dataset_card(
+    name: str,
+    parts: Sequence[LicencedPart],
+    front: Mapping[str, object],
+    template: str,
+    /,
+    **facts: object,
+) -> str:
+    """Return the dataset card: Markdown with the front matter that Hugging Face reads.
+
+    front: Front matter besides name and licence.
+    template: Text of the card, whose placeholders are ``facts`` and ``licences``.
+    """
+    # Several licences may have one identifier there, such as gpl-3.0.
+    ids = list(dict.fromkeys(find_licence(each).hub_id for each in licence_ids(parts)))
+    data = {"pretty_name": name, "license": ids[0] if len(ids) == 1 else ids, **front}
+    head: str = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=10_000)
+    text = Template(template).substitute(facts, licences=licence_summary(parts))
+    return f"---\n{head}---\n\n{text}"
+
+
+def licence_files(parts: Sequence[LicencedPart]) -> dict[str, str]:
+    """Return the texts of the files with all licences, for tools and for readers."""
+    data = json.dumps([part.as_dict() for part in parts], indent=2, ensure_ascii=False)
+    return {LICENCES_FILE: f"{data}\n", LICENCES_TEXT: licences_text(parts)}
+
+
+def licences_text(parts: Sequence[LicencedPart]) -> str:
+    """Return the text of ``LICENCES.md``."""
+    lines = ["# Licences", "", licence_summary(parts), ""]
+    for identifier in licence_ids(parts):
+        licence = find_licence(identifier)
+        limits = f" ({', '.join(licence.restrictions)})" if licence.restrictions else ""
+        heading = f"[{identifier}]({licence.url})" if licence.url else identifier
+        lines += [f"## {heading}{limits}", ""]
+        for part in parts:
+            if part.licence.id == identifier:
+                lines += _part_lines(part)
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _part_lines(part: LicencedPart) -> list[str]:
+    robots = [
+        f"{side}: {', '.join(names)}"
+        for side in SIDES
+        if (names := [name for each, name in part.robots if each == side])
+    ]
+    source = [f"  - source: {' '.join(part.citation.split())}"] if part.citation else []
+    return [f"- **{part.part}**", *source, f"  - robots: {'; '.join(robots)}"]
+
+
+def licence_summary(parts: Sequence[LicencedPart]) -> str:
+    """Return the licences in a sentence, with a line for each part whose licence restricts use."""
+    limits = [
+        f"**{part.part} is {part.licence.id} ({', '.join(part.licence.restrictions)})**: robots "
+        f"{', '.join(dict.fromkeys(name for _, name in part.robots))}."
+        for part in restricted(parts)
+    ]
+    text = (
+        f"The parts of the robots are under {', '.join(licence_ids(parts))}. "
+        f"`{LICENCES_TEXT}` lists parts, sources and robots."
+    )
+    return "\n".join([text, *limits])
+
+
+def croissant_head() -> dict[str, Any]:
+    """Return the context of a Croissant description, to which facts and contents are added."""
+    data: dict[str, Any] = json.loads(read_text(CROISSANT_FILE))
+    return data
+
+
+def croissant_contents(template: str, sums: Mapping[str, str]) -> dict[str, Any]:
+    """Return files and records of a Croissant description.
+
+    template: Name of the template, which describes all files that may exist.
+    sums: Hashes of the files that exist, by path.
+    """
+    data: dict[str, Any] = json.loads(read_text(template))
+    files, data["distribution"] = data["distribution"], []
+    for entry in files:
+        if entry["name"] in sums:
+            data["distribution"].append({**entry, "sha256": sums[entry["name"]]})
+        elif any(PurePosixPath(path).match(entry.get("includes", "-")) for path in sums):
+            data["distribution"].append(entry)  # a set of files
+    return data
+
+
+def licence_addresses(parts: Sequence[LicencedPart]) -> list[str]:
+    """Return the address of each licence of the parts, or its identifier if it has none."""
+    return [find_licence(each).url or each for each in licence_ids(parts)]

@@ -26,23 +26,25 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from pathlib import Path, PurePosixPath
-from string import Template
+from pathlib import Path
 from typing import Any
 
 import msgspec
-import yaml
 
 from morphgen.benchmark.audit import Audit, audit_survey
-from morphgen.benchmark.eval_protocol import EvalProtocol, tasks_of_split
 from morphgen.benchmark.licences import (
+    CROISSANT_FILE,
+    LICENCES_FILE,
     LicencedPart,
-    find_licence,
-    licence_ids,
+    croissant_contents,
+    croissant_head,
+    dataset_card,
+    licence_addresses,
+    licence_files,
     licenced_parts,
     require_allowed,
-    restricted,
 )
+from morphgen.benchmark.scores.submission import EvalProtocol, tasks_of_split
 from morphgen.benchmark.split_folder import (
     BUNDLED,
     FITTED_TOLERANCE,
@@ -90,7 +92,7 @@ from morphgen.formats.files import locked_folder, replacing_folder, writing
 from morphgen.formats.records import Record, read_record
 from morphgen.formats.zip_files import ZipLimits, unpack_zip, write_zip
 from morphgen.grammar.library import Library
-from morphgen.splits.split import SIDES, Split, split_id
+from morphgen.splits.split import Split, split_id
 from morphgen.splits.split_file import find_split, is_split_name, read_split_file
 from morphgen.tasks.goals.split_goals import (
     GOALS,
@@ -104,9 +106,7 @@ from morphgen.tasks.scenes.env_specs import GoalConfig
 from morphgen.typing import Array
 
 RELEASE_FILE = "release.json"
-LICENCES_FILE, LICENCES_TEXT = "licences.json", "LICENCES.md"
 DIFFICULTY_FILE = "difficulty.csv"
-CROISSANT_FILE = "croissant.json"
 SCORES_FILE = "scores.json"
 SUBMISSIONS_DIR = "submissions"
 
@@ -131,7 +131,7 @@ class Release(Record, frozen=True):
     morphgen: str
     """Version of morphgen that made it."""
     evaluation: dict[str, Any]
-    """How submissions are evaluated, see ``morphgen.benchmark.eval_protocol``."""
+    """How submissions are evaluated, see ``morphgen.benchmark.scores.submission``."""
     format: int = FORMAT
     date: str = ""
     """Date of publication, such as ``2027-01-31``; empty if it is not given."""
@@ -219,17 +219,15 @@ def opened_folder(path: Path) -> Iterator[Path]:
 
 
 def croissant_text(
-    split: Split, release: Release, licences: Sequence[str], sums: Mapping[str, str]
+    split: Split, release: Release, parts: Sequence[LicencedPart], sums: Mapping[str, str]
 ) -> str:
-    """Return the text of ``croissant.json``, whose template describes all files that may exist."""
-    data: dict[str, Any] = json.loads(read_text(CROISSANT_FILE))
-    distribution, records = data.pop("distribution"), data.pop("recordSet")
-    data |= {
+    """Return the text of ``croissant.json``."""
+    data = croissant_head() | {
         "name": release.stem,
         "description": f"{split.summary}. A split of robots for cross-embodiment learning: "
         f"{len(split.train)} robots to train on, {len(split.test)} to test on.",
         "version": release.version,
-        "license": [find_licence(each).url or each for each in licences],
+        "license": licence_addresses(parts),
         "citeAs": citation(split, release),
     }
     if release.date:
@@ -239,13 +237,7 @@ def croissant_text(
     if release.creators:
         people = [{"@type": "sc:Organization", "name": name} for name in release.creators]
         data["creator"] = people
-    data["distribution"] = []
-    for entry in distribution:
-        if entry["name"] in sums:
-            data["distribution"].append({**entry, "sha256": sums[entry["name"]]})
-        elif any(PurePosixPath(path).match(entry.get("includes", "-")) for path in sums):
-            data["distribution"].append(entry)  # a set of files
-    data["recordSet"] = records
+    data |= croissant_contents("release_croissant.json", sums)
     return json.dumps(data, indent=2, ensure_ascii=False) + "\n"
 
 
@@ -274,7 +266,7 @@ def card_text(
     names: Iterable[str],
     rows: Sequence[RobotDifficulty],
 ) -> str:
-    """Return the dataset card: Markdown with the front matter that Hugging Face reads.
+    """Return the dataset card.
 
     names: Paths of the files of the release.
     """
@@ -286,8 +278,21 @@ def card_text(
         for line in read_text("release_card.md").splitlines(keepends=True)
         if not line.startswith(tuple(f"| `{name}` |" for name in absent))
     )
-    text = Template(template).substitute(
-        release.evaluation,
+    robots, tasks = len(split.train) + len(split.test), sorted(tasks_of_split(split))
+    front = {
+        "task_categories": ["robotics", "reinforcement-learning"],
+        "tags": ["morphgen", "cross-embodiment", "croissant", split.regime, *tasks],
+        "size_categories": [next((name for n, name in _SIZES if robots < n), "n>100K")],
+        "configs": [
+            {"config_name": "robots", "data_files": [{"split": "robots", "path": ROBOTS_FILE}]}
+        ],
+    }
+    return dataset_card(
+        f"{release.name} {release.version}",
+        parts,
+        front,
+        template,
+        **release.evaluation,
         name=release.name,
         version=release.version,
         summary=split.summary or "(no summary)",
@@ -298,59 +303,8 @@ def card_text(
         id=release.id,
         folder=release.stem,
         difficulty=_difficulty(release, rows),
-        licences=licence_summary(parts),
         citation=citation(split, release),
     )
-    return f"---\n{_front_matter(split, release, parts)}---\n\n{text}"
-
-
-def licences_json(parts: Iterable[LicencedPart]) -> str:
-    """Return the text of ``licences.json``."""
-    return json.dumps([part.as_dict() for part in parts], indent=2, ensure_ascii=False) + "\n"
-
-
-def licences_text(parts: Sequence[LicencedPart]) -> str:
-    """Return the text of ``LICENCES.md``."""
-    lines = ["# Licences", "", licence_summary(parts), ""]
-    for identifier in licence_ids(parts):
-        licence = find_licence(identifier)
-        limits = f" ({', '.join(licence.restrictions)})" if licence.restrictions else ""
-        heading = f"[{identifier}]({licence.url})" if licence.url else identifier
-        lines += [f"## {heading}{limits}", ""]
-        for part in parts:
-            if part.licence.id == identifier:
-                lines += _part_lines(part)
-        lines.append("")
-    return "\n".join(lines)
-
-
-def _part_lines(part: LicencedPart) -> list[str]:
-    robots = [
-        f"{side}: {', '.join(names)}"
-        for side in SIDES
-        if (names := [name for each, name in part.robots if each == side])
-    ]
-    source = [f"  - source: {' '.join(part.citation.split())}"] if part.citation else []
-    return [f"- **{part.part}**", *source, f"  - robots: {'; '.join(robots)}"]
-
-
-def _front_matter(split: Split, release: Release, parts: Sequence[LicencedPart]) -> str:
-    # Several licences may have one identifier there, such as gpl-3.0.
-    ids = list(dict.fromkeys(find_licence(each).hub_id for each in licence_ids(parts)))
-    robots = len(split.train) + len(split.test)
-    tasks = sorted(tasks_of_split(split))
-    data = {
-        "pretty_name": f"{release.name} {release.version}",
-        "license": ids[0] if len(ids) == 1 else ids,
-        "task_categories": ["robotics", "reinforcement-learning"],
-        "tags": ["morphgen", "cross-embodiment", "croissant", split.regime, *tasks],
-        "size_categories": [next((name for n, name in _SIZES if robots < n), "n>100K")],
-        "configs": [
-            {"config_name": "robots", "data_files": [{"split": "robots", "path": ROBOTS_FILE}]}
-        ],
-    }
-    text: str = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=10_000)
-    return text
 
 
 def _difficulty(release: Release, rows: Sequence[RobotDifficulty]) -> str:
@@ -366,20 +320,6 @@ def _difficulty(release: Release, rows: Sequence[RobotDifficulty]) -> str:
         f"the most similar train robot and its value by each measure{scores}.\n\n"
         f"{difficulty_table(test[:MAX_ROWS], baselines, 'github')}"
     )
-
-
-def licence_summary(parts: Sequence[LicencedPart]) -> str:
-    """Return the licences in a sentence, with a line for each part whose licence restricts use."""
-    limits = [
-        f"**{part.part} is {part.licence.id} ({', '.join(part.licence.restrictions)})**: robots "
-        f"{', '.join(dict.fromkeys(name for _, name in part.robots))}."
-        for part in restricted(parts)
-    ]
-    text = (
-        f"The parts of the robots are under {', '.join(licence_ids(parts))}. "
-        f"`{LICENCES_TEXT}` lists parts, sources and robots."
-    )
-    return "\n".join([text, *limits])
 
 
 def build_with_goals(
@@ -527,8 +467,7 @@ def release_split(
         )
         texts = {
             RELEASE_FILE: release_text(release),
-            LICENCES_FILE: licences_json(parts),
-            LICENCES_TEXT: licences_text(parts),
+            **licence_files(parts),
             DIFFICULTY_FILE: difficulty_csv(rows, tuple(results or ())),
         }
         files = {name: text.encode() for name, text in texts.items()} | dict(extra or {})
@@ -536,7 +475,7 @@ def release_split(
         files[README_FILE] = card_text(split, release, parts, known, rows).encode()
         _add_files(report.folder, files)
         sums = read_sums(report.folder / SUMS_FILE)
-        croissant = croissant_text(split, release, licence_ids(parts), sums)
+        croissant = croissant_text(split, release, parts, sums)
         _add_files(report.folder, {CROISSANT_FILE: croissant.encode()})
         return _write_archive(report.folder, out, release)
 

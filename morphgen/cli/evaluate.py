@@ -1,13 +1,34 @@
-"""``morphgen eval``: score a policy or a baseline on each robot."""
+"""``morphgen eval``, ``play``, ``zeroshot`` and ``speed``: run policies and controllers."""
 
 from __future__ import annotations
 
 import argparse
+import itertools
+import math
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import replace
+from importlib import import_module
+
+from tabulate import tabulate
 
 from morphgen.api import evaluation
+from morphgen.api.training import with_goal
 from morphgen.cli import options as opt
-from morphgen.cli.progress import training_progress
-from morphgen.rl.scores import require_table
+from morphgen.cli.progress import bar, print_line, status, training_progress
+from morphgen.rl.evaluation import eval_config_of, zero_shot, zero_shot_data
+from morphgen.rl.inference import Episode
+from morphgen.rl.runs.checkpoint import read_checkpoint
+from morphgen.rl.runs.robot_source import robot_source
+from morphgen.rl.scores import Score, require_table, success_of
+from morphgen.rl.shipped_policies import checkpoint_path, zero_shot_policy
+from morphgen.tables import table
+from morphgen.tasks.reach import GOAL_KINDS
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
+from morphgen.tasks.render.renderer import require_video_path
+from morphgen.tasks.scenes.make import make_batch
+from morphgen.tasks.sim.base import CONTROL_PERIOD
+from morphgen.tasks.speed import measure_speed
 
 
 def evaluate(args: argparse.Namespace) -> None:
@@ -20,3 +41,109 @@ def evaluate(args: argparse.Namespace) -> None:
     opt.print_result(args, result.as_dict(), lambda: str(result))
     if args.out is not None:
         result.write(args.out)
+
+
+def play(args: argparse.Namespace) -> None:
+    """Run the episodes, print a line for each, and name the video."""
+    robot, episodes = " ".join(args.words), itertools.count(1)
+
+    def report(episode: Episode) -> None:
+        angle = (
+            "" if math.isnan(episode.angle) else f" and {math.degrees(episode.angle):.1f} degrees"
+        )
+        print_line(
+            f"episode {next(episodes)}: {'success' if episode.success else 'failure'}, "
+            f"{episode.distance:.3f} m{angle} from the {TASKS[args.task].target}, "
+            f"score {episode.score:.2f}, {episode.seconds:.2f} s"
+            f"{', the simulation diverged' * episode.diverged}"
+        )
+
+    with bar(args, f"preparing {robot} and its goals, and running the episodes"):
+        evaluation.play(robot=robot, show=report, **opt.arguments(args, evaluation.play))
+    if args.out is not None:
+        print_line(str(args.out))
+
+
+def speed(args: argparse.Namespace) -> None:
+    """Measure the speed and print it."""
+    robot, sim = " ".join(args.words), args.sim or DEFAULT_SIMULATOR
+    workers = args.workers or SIMULATORS[sim].default_workers(args.envs)
+    with bar(args, f"preparing {robot} and its goals"):
+        batch = make_batch(
+            args.task,
+            [robot],
+            args.envs,
+            sim=sim,
+            workers=workers,
+            device=args.device or SIMULATORS[sim].devices[0],
+            obstacles=args.obstacles,
+            max_links=None,
+            library=args.library,
+        )
+    with closing(batch), status(args, "measuring"):
+        step = SIMULATORS[sim].native_step
+        # Other processes would not be timed.
+        native_steps = [(import_module(step[0]), step[1])] if step and workers == 1 else []
+        result = measure_speed(batch, args.seconds, own=native_steps)
+
+    def text() -> str:
+        shares = [(part, f"{share:.1%}") for part, share in result.shares.items()]
+        return (
+            f"{args.task}, {batch.specs[0].robot.name}, {args.envs} environments, {sim}, "
+            f"{batch.device.type}, {workers} worker(s)\n"
+            f"environment steps per second: {result.steps_per_second:,.0f}\n"
+            f"physics steps per second:     {result.substeps_per_second:,.0f}\n"
+            f"{tabulate(shares)}"
+        )
+
+    data = {"steps_per_second": result.steps_per_second, "shares": result.shares}
+    opt.print_result(args, data, text)
+
+
+FILM_EPISODES = 3
+"""Number of episodes in a video."""
+
+
+def zeroshot(args: argparse.Namespace) -> None:
+    """Run the episodes, print the table, and write the video."""
+    if args.out is not None:
+        require_video_path(args.out)
+    TASKS[args.task]  # raises if the task is unknown
+    with_goal((), args.goal, [args.task])  # raises if the goal is not for the task
+    if args.policy is None:
+        goal = args.goal or GOAL_KINDS[0]
+        policy = zero_shot_policy(args.task, goal, obstacles=args.obstacles).file
+    else:
+        policy = checkpoint_path(args.policy)
+    with status(args, "reading the robot"):
+        source = robot_source(
+            " ".join(args.words), args.task, obstacles=args.obstacles, library=tuple(args.library)
+        )
+        run, _ = read_checkpoint(policy)
+    config = eval_config_of(run, args.episodes, seed=args.seed, workers=args.workers)
+    tasks = with_goal(config.tasks, args.goal, [args.task])
+    config = replace(config, sim=args.sim or DEFAULT_SIMULATOR, tasks=tasks)
+    with bar(args, "preparing the goals", "episode"):
+        scores = zero_shot(source, policy, config)
+    opt.print_result(args, zero_shot_data(scores), lambda: _table(scores, args.task))
+    if args.out is not None:
+        with status(args, "filming"):
+            given = opt.arguments(args, evaluation.play)
+            given |= {"policy": policy, "sim": config.sim, "episodes": FILM_EPISODES}
+            one_second = round(1 / CONTROL_PERIOD)
+            evaluation.play(robot=source.name, max_successes=one_second, **given)
+        print_line(str(args.out))
+
+
+def _table(scores: Mapping[str, Score], task: str) -> str:
+    columns = {
+        "controller": list(scores),
+        "success": [success_of([score]).as_percent() for score in scores.values()],
+        "distance [m]": [f"{score.distance:.3f}" for score in scores.values()],
+    }
+    if not any(math.isnan(score.angle) for score in scores.values()):
+        angles = (math.degrees(score.angle) for score in scores.values())
+        columns["angle [deg]"] = [f"{angle:.1f}" for angle in angles]
+    if TASKS[task].relative_to_random:  # the score of others is their success
+        columns["score"] = [f"{score.score:.1f}" for score in scores.values()]
+    return table(list(zip(*columns.values(), strict=True)), list(columns), formats="g")

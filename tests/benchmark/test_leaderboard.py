@@ -19,7 +19,6 @@ from helpers.submissions import (
     data,
     submission,
 )
-from morphgen.benchmark.eval_protocol import EvalProtocol
 from morphgen.benchmark.scores import results as results_module
 from morphgen.benchmark.scores.results import (
     References,
@@ -35,7 +34,12 @@ from morphgen.benchmark.scores.results import (
     score_submission,
     study_results,
 )
-from morphgen.benchmark.scores.submission import EPISODES, append_submission, require_same_random
+from morphgen.benchmark.scores.submission import (
+    EPISODES,
+    EvalProtocol,
+    append_submission,
+    require_same_random,
+)
 from morphgen.benchmark.survey import BaselineResult
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import default_library

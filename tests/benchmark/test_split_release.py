@@ -12,7 +12,6 @@ import yaml
 from helpers.commands import tree
 from helpers.splits import TEST, TRAIN, combined, member
 from morphgen.benchmark import release as release_module
-from morphgen.benchmark.eval_protocol import EvalProtocol
 from morphgen.benchmark.release import (
     CROISSANT_FILE,
     DIFFICULTY_FILE,
@@ -24,6 +23,7 @@ from morphgen.benchmark.release import (
     release_split,
     verify,
 )
+from morphgen.benchmark.scores.submission import EvalProtocol
 from morphgen.benchmark.split_folder import (
     SUMS_FILE,
     BuildSettings,

@@ -7,9 +7,10 @@ import pytest
 
 from helpers.runs import small_source, small_split
 from helpers.submissions import EXPECTED, PROTOCOL, SPLIT, TEST, VERSION, changed, data, submission
-from morphgen.benchmark.eval_protocol import EvalProtocol, protocol_from
 from morphgen.benchmark.scores.submission import (
+    EvalProtocol,
     check_submission,
+    protocol_from,
     read_submission,
     submission_text,
 )

@@ -11,8 +11,14 @@ from msgspec.structs import replace as replaced
 
 from helpers.splits import combined
 from helpers.submissions import data
-from morphgen.benchmark.eval_protocol import EvalProtocol, expected_robots
-from morphgen.benchmark.scores.submission import EPISODES, SplitName, append_submission, read_table
+from morphgen.benchmark.scores.submission import (
+    EPISODES,
+    EvalProtocol,
+    SplitName,
+    append_submission,
+    expected_robots,
+    read_table,
+)
 from morphgen.encoding.similarity import MEASURES
 from morphgen.grammar.library import default_library
 from morphgen.splits.split import sided_members, split_id

@@ -11,7 +11,7 @@ import pytest
 from helpers.commands import tree
 from helpers.splits import TRAIN, combined, member
 from helpers.submissions import data
-from morphgen.benchmark.eval_protocol import EvalProtocol, expected_robots
+from morphgen.benchmark.scores.submission import EvalProtocol, expected_robots
 from morphgen.grammar.library import default_library
 from morphgen.splits.split_file import read_split, split_text
 

@@ -5,8 +5,13 @@ import copy
 import msgspec
 
 from helpers.runs import small_split
-from morphgen.benchmark.eval_protocol import EvalProtocol, expected_robots
-from morphgen.benchmark.scores.submission import FORMAT, KIND, Submission
+from morphgen.benchmark.scores.submission import (
+    FORMAT,
+    KIND,
+    EvalProtocol,
+    Submission,
+    expected_robots,
+)
 from morphgen.errors import BenchmarkError
 from morphgen.formats.records import read_record
 from morphgen.grammar.library import default_library

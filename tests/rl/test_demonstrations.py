@@ -12,7 +12,7 @@ import torch
 
 import morphgen
 from morphgen.benchmark.demonstrations import describe
-from morphgen.benchmark.release import CROISSANT_FILE
+from morphgen.benchmark.licences import CROISSANT_FILE
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import FormatError, MorphgenError, TaskError
 from morphgen.formats.bundle import read_bundle

@@ -19,12 +19,13 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from morphgen.benchmark.eval_protocol import EvalProtocol, expected_robots
 from morphgen.benchmark.release import SCORES_FILE, SUBMISSIONS_DIR
 from morphgen.benchmark.scores.submission import (
     EPISODES,
+    EvalProtocol,
     Submission,
     check_submission,
+    expected_robots,
     name_of,
     read_submission,
     read_submissions,

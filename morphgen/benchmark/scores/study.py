@@ -18,7 +18,6 @@ import msgspec
 import numpy as np
 from filelock import FileLock, Timeout
 
-from morphgen.benchmark.eval_protocol import rules_data
 from morphgen.benchmark.scores.results import NOTE, result_rows, result_tables, rows_data
 from morphgen.benchmark.scores.submission import (
     EPISODES,
@@ -29,6 +28,7 @@ from morphgen.benchmark.scores.submission import (
     mode_of,
     name_of,
     read_table,
+    rules_data,
 )
 from morphgen.errors import MorphgenError, TaskError
 from morphgen.formats.files import LOCK, write_file
