@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import io
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import matplotlib
 import numpy as np
@@ -17,7 +16,7 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.transforms import Bbox
 
-from morphgen.encoding.similarity import MdsMap
+from morphgen.encoding.similarity import classical_mds, get_measure, to_distances
 from morphgen.typing import Array
 
 MAX_NAMED = 60
@@ -43,23 +42,6 @@ _LABEL_DIRECTIONS = np.array(
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Panel:
-    """A similarity matrix to draw."""
-
-    title: str
-    values: Array  # the matrix, shape (n, n)
-    larger_is_more_alike: bool  # whether the values are similarities; distances otherwise
-
-
-@dataclass(frozen=True, eq=False)
-class MapPanel:
-    """A map to draw."""
-
-    title: str
-    map: MdsMap  # the map of n points
-
-
 @contextmanager
 def _default_style() -> Iterator[None]:
     """Draw with matplotlib's default settings, whatever the user's."""
@@ -69,59 +51,61 @@ def _default_style() -> Iterator[None]:
 
 
 @_default_style()
-def heatmap_png(names: Sequence[str], panels: Sequence[Panel]) -> bytes:
-    """Draw matrices side by side, bright where robots are similar, and return the PNG.
+def heatmap_png(names: Sequence[str], matrices: Mapping[str, Array]) -> bytes:
+    """Draw matrices by measure side by side, bright where robots are similar; return the PNG.
 
     Up to ``MAX_NAMED`` robots are named, and up to ``MAX_WITH_VALUES`` have their values written.
     """
     n = len(names)
     side = max(_MIN_SIDE, n * _ROW_HEIGHT) if n <= MAX_NAMED else _UNNAMED_SIDE
     margin = _LETTER_WIDTH * max(map(len, names)) if n <= MAX_NAMED else 0.3
-    size = (margin + len(panels) * (side + 0.9), margin + side + 0.5)
+    size = (margin + len(matrices) * (side + 0.9), margin + side + 0.5)
     figure = Figure(figsize=size, dpi=_DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1))
-    axes = figure.subplots(1, len(panels), squeeze=False)[0]
-    for panel, ax in zip(panels, axes, strict=True):
-        colours = "viridis" if panel.larger_is_more_alike else "viridis_r"
-        apart = panel.values[~np.eye(n, dtype=bool)] if n > 1 else panel.values.ravel()
-        image = ax.imshow(panel.values, colours, vmin=apart.min(), vmax=apart.max())
+    axes = figure.subplots(1, len(matrices), squeeze=False)[0]
+    for (measure, values), ax in zip(matrices.items(), axes, strict=True):
+        is_similarity = get_measure(measure).larger_is_more_alike
+        apart = values[~np.eye(n, dtype=bool)] if n > 1 else values.ravel()
+        low, high = float(apart.min()), float(apart.max())
+        image = ax.imshow(values, "viridis" if is_similarity else "viridis_r", vmin=low, vmax=high)
         figure.colorbar(image, ax=ax, fraction=0.045, pad=0.02).ax.tick_params(labelsize=8)
-        ax.set_title(panel.title, fontsize=10)
-        _name_rows(ax, names, first=panel is panels[0])
+        ax.set_title(get_measure(measure).title, fontsize=10)
+        _name_rows(ax, names, first=ax is axes[0])
         if n <= MAX_WITH_VALUES:
-            _write_values(ax, panel, float(apart.min()), float(apart.max()))
+            _write_values(ax, values, low, high, is_similarity=is_similarity)
     return _png(figure)
 
 
 @_default_style()
-def map_png(names: Sequence[str], panels: Sequence[MapPanel], groups: Sequence[str]) -> bytes:
-    """Draw maps side by side and return the PNG.
+def map_png(names: Sequence[str], matrices: Mapping[str, Array], groups: Sequence[str]) -> bytes:
+    """Draw a map for each matrix by measure, side by side, and return the PNG.
 
     Colours and markers distinguish the largest groups of robots, which the legend names. Robots are
     named where there is room; of many robots, some that are spread over the map.
     """
     legend_width = 0.9 + 0.8 * _LETTER_WIDTH * max(map(len, groups))
-    size = (7.0 * len(panels) + legend_width, 7)
+    size = (7.0 * len(matrices) + legend_width, 7)
     figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
     canvas = FigureCanvasAgg(figure)
-    axes = figure.subplots(1, len(panels), squeeze=False)[0]
-    for panel, ax in zip(panels, axes, strict=True):
-        first, second = panel.map.shares
-        ax.set_title(panel.title, fontsize=10)
+    axes = figure.subplots(1, len(matrices), squeeze=False)[0]
+    maps = [classical_mds(to_distances(matrix, name)) for name, matrix in matrices.items()]
+    for measure, mds_map, ax in zip(matrices, maps, axes, strict=True):
+        first, second = mds_map.shares
+        ax.set_title(get_measure(measure).title, fontsize=10)
         ax.set_xlabel(f"first dimension of the distances, {first:.0%} of their variation")
         ax.set_ylabel(f"second dimension, {second:.0%}")
         ax.set_aspect("equal", "datalim")
         ax.margins(0.12)
         ax.grid(color="0.92")
         ax.set_axisbelow(True)
-        _scatter(ax, panel.map.points, groups)
+        _scatter(ax, mds_map.points, groups)
     handles, labels = axes[0].get_legend_handles_labels()
     legend = figure.legend(handles, labels, fontsize=8, loc="outside right upper")
     for text in legend.get_texts():
         text.set_parse_math(False)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
-    for panel, ax in zip(panels, axes, strict=True):
-        _name_points(ax, panel.map.points, names, canvas)
+    for mds_map, ax in zip(maps, axes, strict=True):
+        _name_points(ax, mds_map.points, names, canvas)
     return _png(figure)
 
 
@@ -144,11 +128,11 @@ def _name_rows(ax: Axes, names: Sequence[str], *, first: bool) -> None:
     ax.tick_params(length=0)
 
 
-def _write_values(ax: Axes, panel: Panel, low: float, high: float) -> None:
+def _write_values(ax: Axes, values: Array, low: float, high: float, *, is_similarity: bool) -> None:
     """Write the value into every cell, dark on bright and white on dark."""
-    for (row, column), value in np.ndenumerate(panel.values):
+    for (row, column), value in np.ndenumerate(values):
         bright = (value - low) / (high - low) if high > low else 0.0
-        if not panel.larger_is_more_alike:
+        if not is_similarity:
             bright = 1 - bright
         colour = "black" if bright > 0.6 else "white"
         text = f"{value:.2f}".replace("0.", ".", 1) if abs(value) < 0.995 else f"{value:.0f}"

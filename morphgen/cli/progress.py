@@ -45,6 +45,8 @@ def bar(
 class _StagedBar:
     """A bar that gives its place to the bars of stages."""
 
+    _show: Progress | None = None
+
     def __init__(
         self,
         open_stage: Callable[[str, str], AbstractContextManager[Progress]],
@@ -53,10 +55,15 @@ class _StagedBar:
     ) -> None:
         self._open_stage, self._unit, self._open_bar = open_stage, unit, open_bar
         self._shown = ExitStack()
-        self._show = self._shown.enter_context(open_bar())
+        self._show = self._open()
+
+    def _open(self) -> Progress:
+        self.close()
+        return self._shown.enter_context(self._open_bar())
 
     def __call__(self, done: float, total: int | None) -> None:
-        """Set the bar."""
+        """Set the bar, which is shown again if something else has taken its place."""
+        self._show = self._show or self._open()
         self._show(done, total)
 
     @contextmanager
@@ -65,15 +72,16 @@ class _StagedBar:
         self.close()
         with self._open_stage(title, unit or self._unit) as show, show_progress(show):
             yield
-        self._show = self._shown.enter_context(self._open_bar())
+        self._show = self._open()
 
     def note(self, text: str) -> None:
         """Print a line above the bar."""
         note(text)
 
     def close(self) -> None:
-        """Remove the bar."""
+        """Remove what is shown."""
         self._shown.close()
+        self._show = None
 
 
 @contextmanager
@@ -223,23 +231,16 @@ def training_progress(how_to_resume: str | None = None) -> Iterator[TrainingProg
         display.close()
 
 
-class TrainingProgress:
-    """Shows the progress of trainings and evaluations, one after the other."""
+class TrainingProgress(_StagedBar):
+    """Shows goal sets, trainings and evaluations, one after the other."""
 
     def __init__(self) -> None:
-        self._shown = ExitStack()
-        self._shown.enter_context(status(None, "preparing"))
-        self._goal_bar: Progress | None = None
-
-    def __call__(self, done: float, total: int | None) -> None:
-        """Show how many of the robots have their goal set."""
-        if self._goal_bar is None:
-            self.close()
-            self._goal_bar = self._shown.enter_context(_bar(None, "goal sets"))
-        self._goal_bar(done, total)
-        if done == total:
-            self.close()
-            self._shown.enter_context(status(None, "preparing"))
+        layout = "{l_bar}{bar}| {n:.1f}/{total_fmt} [{elapsed}<{remaining}]"
+        super().__init__(
+            partial(_bar, None, layout=layout, delay=0),
+            "episode",
+            partial(_bar, None, "preparing", "goal set"),
+        )
 
     def training(self, subrun: Subrun) -> ShowMetrics:
         """Begin with a subrun; return the function that shows its metrics.
@@ -283,25 +284,6 @@ class TrainingProgress:
             show(report, total, {metric: f"{getattr(report, metric):.2f}", "success": success})
 
         return update
-
-    @contextmanager
-    def stage(self, title: str, unit: str = "") -> Iterator[None]:
-        """Show how many episodes of an evaluation ended, or what else the stage counts."""
-        raise_if_interrupted()
-        self.close()
-        layout = "{l_bar}{bar}| {n:.1f}/{total_fmt} [{elapsed}<{remaining}]"
-        unit = unit or "episode"
-        with _bar(None, title, unit, layout=layout, delay=0) as show, show_progress(show):
-            yield
-
-    def note(self, text: str) -> None:
-        """Print a line above the bar."""
-        note(text)
-
-    def close(self) -> None:
-        """Finish the bar that is shown."""
-        self._shown.close()
-        self._goal_bar = None
 
 
 def _draw_update(

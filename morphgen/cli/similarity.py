@@ -16,7 +16,6 @@ from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, status, track
 from morphgen.encoding.similarity import (
     Features,
-    classical_mds,
     features,
     get_measure,
     similarity_matrix,
@@ -147,7 +146,7 @@ def _text(names: Sequence[str], measure: str, values: Array) -> str:
     pairs = values[np.triu_indices(len(values), 1)]  # the matrix is symmetric: each pair once
     low, median, high = np.percentile(pairs, (0, 50, 100))
     return (
-        f"{_title(measure)}; {better} is more alike\n{rows}\n"
+        f"{get_measure(measure).title}; {better} is more alike\n{rows}\n"
         f"{len(pairs)} pairs: mean {pairs.mean():.3f}, median {median:.3f}, "
         f"from {low:.3f} to {high:.3f}"
     )
@@ -172,25 +171,15 @@ def _nearest_table(names: Sequence[str], measure: str, values: Array) -> str:
 
 
 def _heatmap(names: Sequence[str], matrices: dict[str, Array], groups: Sequence[str]) -> bytes:
-    from morphgen.benchmark.figures import Panel, heatmap_png
+    from morphgen.benchmark.figures import heatmap_png
 
-    panels = []
-    for name, values in matrices.items():
-        panels.append(Panel(_title(name), values, get_measure(name).larger_is_more_alike))
-    return heatmap_png(names, panels)
+    return heatmap_png(names, matrices)
 
 
 def _map(names: Sequence[str], matrices: dict[str, Array], groups: Sequence[str]) -> bytes:
-    from morphgen.benchmark.figures import MapPanel, map_png
+    from morphgen.benchmark.figures import map_png
 
-    panels = []
-    for name, values in matrices.items():
-        panels.append(MapPanel(_title(name), classical_mds(to_distances(values, name))))
-    return map_png(names, panels, groups)
-
-
-def _title(measure: str) -> str:
-    return f"{measure}: {get_measure(measure).meaning}"
+    return map_png(names, matrices, groups)
 
 
 def _csv(names: Sequence[str], matrices: dict[str, Array], groups: Sequence[str]) -> bytes:

@@ -418,6 +418,11 @@ class Measure:
     larger_is_more_alike: bool  # True for a similarity, False for a distance
     meaning: str  # description for users
 
+    @property
+    def title(self) -> str:
+        """Name and meaning."""
+        return f"{self.name}: {self.meaning}"
+
 
 def features(robot: Robot, shapes: Mapping[str, Shape], *, max_links: int = MAX_LINKS) -> Features:
     """Compute the properties of a robot that the measures compare.

@@ -12,8 +12,6 @@ from morphgen.benchmark import figures
 from morphgen.benchmark.figures import (
     MAX_NAMED,
     MAX_WITH_VALUES,
-    MapPanel,
-    Panel,
     heatmap_png,
     map_png,
 )
@@ -24,13 +22,9 @@ def names(n):
     return [f"arm-{i:06d}" if i % 3 else f"hand_{i}" for i in range(n)]
 
 
-def panel(n, title="tree", larger=False):
+def matrices(n):
     points = np.random.default_rng(0).random((n, 3))
-    return Panel(title, np.linalg.norm(points[:, None] - points, axis=-1), larger)
-
-
-def map_panel(n, title="tree"):
-    return MapPanel(title, classical_mds(panel(n).values))
+    return {"tree": np.linalg.norm(points[:, None] - points, axis=-1)}
 
 
 def groups(n):
@@ -38,7 +32,7 @@ def groups(n):
 
 
 def drawings(n):
-    return heatmap_png(names(n), [panel(n)]), map_png(names(n), [map_panel(n)], groups(n))
+    return heatmap_png(names(n), matrices(n)), map_png(names(n), matrices(n), groups(n))
 
 
 def pixels(png):
@@ -73,8 +67,8 @@ def test_bright_cells_mean_similar_robots_for_every_measure():
     n = MAX_NAMED + 20
     half = np.arange(n) < n / 2
     apart = (half[:, None] != half).astype(float)
-    for values, larger in ((apart, False), (1 - apart, True)):
-        picture = pixels(heatmap_png(names(n), [Panel("", values, larger)]))
+    for measure, values in (("tree", apart), ("cosine", 1 - apart)):
+        picture = pixels(heatmap_png(names(n), {measure: values}))
         height, width, _ = picture.shape
         alike, different = picture[height // 4, width // 4], picture[height // 4, 3 * width // 4]
         assert alike.sum() > 450
@@ -82,18 +76,20 @@ def test_bright_cells_mean_similar_robots_for_every_measure():
 
 
 def test_robots_of_a_matrix_are_labelled_up_to_a_limit():
-    few = pixels(heatmap_png(["a" * 20] * 20, [panel(20)]))
-    short = pixels(heatmap_png(["a"] * 20, [panel(20)]))
+    few = pixels(heatmap_png(["a" * 20] * 20, matrices(20)))
+    short = pixels(heatmap_png(["a"] * 20, matrices(20)))
     assert few.shape[0] > short.shape[0] + 50
     assert few.shape[1] > short.shape[1] + 50
     many = MAX_NAMED + 1
-    assert heatmap_png(["a" * 20] * many, [panel(many)]) == heatmap_png(["b"] * many, [panel(many)])
+    assert heatmap_png(["a" * 20] * many, matrices(many)) == heatmap_png(
+        ["b"] * many, matrices(many)
+    )
 
 
 def test_names_are_not_parsed_as_formulas():
     odd = ["$\\frac$", "a_b", "$", "\\alpha"]  # the first would be refused as one
-    assert heatmap_png(odd, [panel(4)])
-    assert map_png(odd, [map_panel(4)], odd)
+    assert heatmap_png(odd, matrices(4))
+    assert map_png(odd, matrices(4), odd)
 
 
 @pytest.fixture
@@ -103,7 +99,7 @@ def drawn(monkeypatch):
     def draw(n, groups):
         kept = []
         monkeypatch.setattr(figures, "_png", lambda figure: kept.append(figure) or b"")
-        map_png(names(n), [map_panel(n)], groups)
+        map_png(names(n), matrices(n), groups)
         return kept[0]
 
     return draw
@@ -126,7 +122,7 @@ def test_a_map_has_names_that_cover_neither_each_other_nor_points(n, drawn):
 def test_a_map_names_its_axes_and_its_groups(drawn):
     figure = drawn(40, ["4 DoF"] * 10 + ["6 DoF"] * 30)
     (ax,) = figure.axes
-    first, second = map_panel(40).map.shares
+    first, second = classical_mds(matrices(40)["tree"]).shares
     assert f"{first:.0%}" in ax.get_xlabel()
     assert f"{second:.0%}" in ax.get_ylabel()
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
