@@ -298,7 +298,6 @@ def _finding(code: str, side: Side, name: str, why: str, severity: Severity = "e
 
 
 Mask = NDArray[np.bool_]
-SidedReason = tuple[Side, str, str]  # side and name of a robot, and the reason of its finding
 
 EXACT = 1e-6  # largest difference between numbers of a set and those of the same set sampled anew
 NEAR = 1e-3  # distance below which positions of goals or blocks are the same [m]
@@ -356,11 +355,8 @@ def audit_goals(
     examined = list(parallel_map(partial(_examine, library, goals), members, jobs))
     return (
         *_set_findings(split, goals, members, examined),
-        *(_finding("goals-shared", *reason) for reason in shared_goals(split, goals)),
-        *(
-            _finding("goals-repeated", *reason, "warning")
-            for reason in _repeated_goals(split, goals)
-        ),
+        *_shared_goals(split, goals),
+        *_repeated_goals(split, goals),
     )
 
 
@@ -488,7 +484,7 @@ def _task_text(task: str, obstacles: bool) -> str:
     return f"{task} with obstacles" if obstacles else task
 
 
-def shared_goals(split: Split, goals: SplitGoals) -> Iterator[SidedReason]:
+def _shared_goals(split: Split, goals: SplitGoals) -> Iterator[Finding]:
     """Yield test robots whose goals leaked into the set of a train robot."""
     for member in split.test:
         test = goals.get("test", member.name)
@@ -502,7 +498,7 @@ def shared_goals(split: Split, goals: SplitGoals) -> Iterator[SidedReason]:
             count, noun, name = max(leaks, key=lambda leak: leak[0])
             more = f" (and {len(leaks) - 1} more)" if leaks[1:] else ""
             reason = f"train robot {name}{more} has {count} of its {len(test.q)} {noun}"
-            yield "test", member.name, reason
+            yield _finding("goals-shared", "test", member.name, reason)
 
 
 def _num_shared(test: GoalSet, train: GoalSet, same_robot: bool) -> tuple[int, str]:
@@ -520,7 +516,7 @@ def _num_shared(test: GoalSet, train: GoalSet, same_robot: bool) -> tuple[int, s
     return (count, noun) if count > MAX_SHARED * len(test.q) else (0, noun)
 
 
-def _repeated_goals(split: Split, goals: SplitGoals) -> Iterator[SidedReason]:
+def _repeated_goals(split: Split, goals: SplitGoals) -> Iterator[Finding]:
     """Yield robots whose set has a goal twice."""
     for side, member in sided_members(split):
         goal_set = goals.get(side, member.name)
@@ -533,7 +529,7 @@ def _repeated_goals(split: Split, goals: SplitGoals) -> Iterator[SidedReason]:
         if pairs:
             more = f" (and {len(pairs) - 1} more pairs)" if pairs[1:] else ""
             reason = f"goals {pairs[0][0]} and {pairs[0][1]} of its set are the same{more}"
-            yield side, member.name, reason
+            yield _finding("goals-repeated", side, member.name, reason, "warning")
 
 
 def _near(a: Array, b: Array) -> Mask:

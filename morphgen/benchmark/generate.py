@@ -152,6 +152,7 @@ def _drawn_splits(
     sides = [train[:size] for size in sorted({request.train[0], request.train[-1]})]
     library = factory.library
     parsed = [[RuledRobot.of(each, library) for each in side] for side in sides]
+    name_by_hash = {robot.hash: robot.name for robot in train}
 
     def violated(derivation: Derivation) -> str:
         """Return the reason of the first finding that an audit would have; empty if none."""
@@ -160,54 +161,40 @@ def _drawn_splits(
         return next((_REASONS[code] for code, _, _ in itertools.chain(*found)), "")
 
     def refused(robot: Candidate) -> str:
+        if twin := name_by_hash.get(robot.hash):
+            return f"the body of {twin}"
         # A robot has another derivation if the conditions of its grammar reject the first one.
         reasons = (reject(robot, side) for side in sides)
         return violated(robot.derivation) or next(filter(None, reasons), "")
 
-    test = _find_test_robots(request, train, test_streams, factory, violated, refused, advice)
-    seeds = {stream.prefix: stream.seed for stream in (*train_streams, *test_streams)}
-    return assemble_drawn(request, regime, summary, train, test, {**provenance, "seeds": seeds})
-
-
-def _find_test_robots(
-    request: SplitRequest,
-    train: Sequence[Candidate],
-    streams: Sequence[RobotStream],
-    factory: RobotFactory,
-    violated: Callable[[Derivation], str],
-    refused: Callable[[Candidate], str],
-    advice: Callable[[], str],
-) -> list[Candidate]:
-    """Take test robots from the streams in turn, number by number."""
-    name_by_hash = {robot.hash: robot.name for robot in train}
-    found: list[Candidate] = []
+    test: list[Candidate] = []
     rejected: Counter[str] = Counter()
     num_composed = 0  # robots that were composed and rejected
-    for number, stream in ((n, each) for n in itertools.count() for each in streams):
-        if len(found) == request.test:
-            return found
+    numbers = ((number, stream) for number in itertools.count() for stream in test_streams)
+    while len(test) < request.test:
         if rejected.total() == MAX_DRAWS or num_composed == MAX_COMPOSED:
-            break
-        derivation = stream.derivation(number, factory.library)
+            reason, count = rejected.most_common(1)[0]
+            raise BenchmarkError(
+                f"{', '.join(stream.grammar.name for stream in test_streams)}: {len(test)} of "
+                f"{request.test} test robots found in {rejected.total() + len(test)} draws; "
+                f"{count} had {reason}; {advice()}"
+            )
+        number, stream = next(numbers)
+        derivation = stream.derivation(number, library)
         if reason := violated(derivation) if derivation else "no end":
             rejected[reason] += 1
             continue
         with show_progress(None):  # one robot is one step, whatever its fits report
             robot = factory(stream.recipe(number))
-        twin = name_by_hash.get(robot.hash)
-        if reason := f"the body of {twin}" if twin else refused(robot):
+        if reason := refused(robot):
             rejected[reason] += 1
             num_composed += 1
             continue
         name_by_hash[robot.hash] = robot.name
-        found.append(robot)
-        report(len(train) + len(found), None)
-    reason, count = rejected.most_common(1)[0]
-    raise BenchmarkError(
-        f"{', '.join(stream.grammar.name for stream in streams)}: {len(found)} of {request.test} "
-        f"test robots found in {rejected.total() + len(found)} draws; {count} had {reason}; "
-        f"{advice()}"
-    )
+        test.append(robot)
+        report(len(train) + len(test), None)
+    seeds = {stream.prefix: stream.seed for stream in (*train_streams, *test_streams)}
+    return assemble_drawn(request, regime, summary, train, test, {**provenance, "seeds": seeds})
 
 
 def assemble(

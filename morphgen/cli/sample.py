@@ -15,8 +15,8 @@ from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, status, track
 from morphgen.errors import FormatError
 from morphgen.fitting.replace_collision import as_spheres, with_geometry
-from morphgen.formats.bundle import CARD, URDF, write_bundle
-from morphgen.formats.data_files import read_json, read_text
+from morphgen.formats.bundle import CARD, URDF, read_card, write_bundle
+from morphgen.formats.data_files import read_text
 from morphgen.grammar import analysis
 from morphgen.grammar.analysis import check_grammar, count_structures, load_sound_grammar, variables
 from morphgen.grammar.compose import compose
@@ -41,9 +41,9 @@ from morphgen.grammar.robot_set import (
     read_index,
     read_settings,
 )
-from morphgen.grammar.robot_source import find_robots
+from morphgen.grammar.robot_source import find_robots, is_robot_folder, light_derivation
 from morphgen.grammar.sampling import mutate as mutations
-from morphgen.grammar.syntax import COUNT_DIGITS, MAX_COUNT, MAX_DERIVATION_TEXT, MAX_TEXT
+from morphgen.grammar.syntax import COUNT_DIGITS, MAX_COUNT, MAX_TEXT
 from morphgen.grammar.values import parse_conditions
 
 
@@ -212,7 +212,7 @@ def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> st
     robot = compose(derivation, library, folder.resolve().name)
     if not (folder / CARD).is_file():  # a light set has no meshes and no card
         return light_urdf(robot)
-    card = _card(folder)
+    card = read_card(folder)
     if "convex" in card:
         robot = with_geometry(robot, "convex", library.folders)
     primitives = card.get("primitives")
@@ -239,22 +239,16 @@ def _replayed_urdf(folder: Path, derivation: Derivation, library: Library) -> st
 
 def _stored_derivation(folder: Path) -> Derivation:
     _require_folder(folder)
-    light, card = folder / DERIVATION, folder / CARD
-    if light.is_file():
-        return parse_derivation(read_text(light, MAX_DERIVATION_TEXT), str(light))
-    if not card.is_file():
+    if light := light_derivation(folder):
+        return light
+    if not is_robot_folder(folder):
         raise FormatError(f"{folder} is not a robot: it has neither {CARD} nor {DERIVATION}")
-    content = _card(folder)
-    if not isinstance(content.get("derivation"), str):
-        raise FormatError(f"{card} has no derivation: the robot was imported, not composed")
-    return parse_derivation(content["derivation"], str(card))
-
-
-def _card(folder: Path) -> dict[str, Any]:
-    content = read_json(folder / CARD)
-    if not isinstance(content, dict):
-        raise FormatError(f"{folder / CARD}: expected an object, not {type(content).__name__}")
-    return content
+    text = read_card(folder).get("derivation")
+    if not isinstance(text, str):
+        raise FormatError(
+            f"{folder / CARD} has no derivation: the robot was imported, not composed"
+        )
+    return parse_derivation(text, str(folder / CARD))
 
 
 def _require_folder(folder: Path) -> None:

@@ -10,8 +10,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
 
-from morphgen.api.goals import goals as sample_goals
 from morphgen.api.splits import DEFAULT_TRAIN, NewSplit
+from morphgen.api.splits import goals as sample_goals
 from morphgen.api.splits import split as open_split
 from morphgen.benchmark import release as releases
 from morphgen.benchmark.audit import Audit

@@ -115,7 +115,7 @@ def write_bundle(
 
 def read_bundle(folder: Path, *, root: Path | None = None) -> Robot:
     """Read a robot from its bundle."""
-    card = _read_card(folder)
+    card = read_card(folder)
     robot = read_urdf(folder / URDF, finder=default_finder(root=root), keep_order=True)
     return replace(apply_card(robot, card, str(folder / CARD)), fits=fits_in(folder))
 
@@ -130,7 +130,8 @@ def fits_in(folder: Path) -> StoredFits:
     return read_fits(path)
 
 
-def _read_card(folder: Path) -> dict[str, Any]:
+def read_card(folder: Path) -> dict[str, Any]:
+    """Return the content of a bundle's card."""
     card_path = folder / CARD
     if not card_path.is_file():
         is_light = (folder / URDF).is_file()
@@ -144,7 +145,7 @@ def _read_card(folder: Path) -> dict[str, Any]:
 
 def _card_hashes(folder: Path) -> dict[str, object]:
     """Return the SHA-256 of every file of a bundle but the card and the picture, by its path."""
-    hashes = _read_card(folder).get("hashes")
+    hashes = read_card(folder).get("hashes")
     if not isinstance(hashes, dict):
         raise FormatError(f"{folder / CARD}: hashes: expected an object, not {hashes!r}")
     return hashes
