@@ -59,7 +59,7 @@ from morphgen.formats.bundle import (
     write_bundle,
 )
 from morphgen.formats.data_files import parse_json, read_json, read_text
-from morphgen.formats.files import folder_hashes, leftovers, locked_folder
+from morphgen.formats.files import begin_folder, folder_hashes, locked_folder
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.formats.zip_files import read_npz
 from morphgen.grammar.library import Library
@@ -394,7 +394,10 @@ def build_split(
     split_folder = split_folder_path(split, folder)
     members = unique_robots(split)
     with writing_split(split_folder), _removed_if_empty(split_folder):
-        _prepare(split_folder, split, settings)
+        build = _Settings(1, split_id(split), settings.light, settings.picture)
+        path = split_folder / BUILD_FILE
+        begin_folder(path, msgspec.to_builtins(build), "built split", BenchmarkError)
+        write_atomic(split_folder / SPLIT_FILE, split_text(split))
         with locked_folder(split_folder):
             (split_folder / SUMS_FILE).unlink(missing_ok=True)  # marks the folder as unfinished
             for leftover in (split_folder / ROBOTS_DIR).glob(".*"):  # of an interrupted build
@@ -436,31 +439,6 @@ def _write_member(
         write_bundle(robot, folder, check(robot), picture=settings.picture, edits_kept=False)
     measured = measure_robot(robot, library, max_links, with_features=False)
     return not is_kept, measured, folder_hashes(folder)
-
-
-def _prepare(split_folder: Path, split: Split, settings: BuildSettings) -> None:
-    """Create the folder, or check that it has the same split with the same settings."""
-    build = _Settings(1, split_id(split), settings.light, settings.picture)
-    data, text = msgspec.to_builtins(build), split_text(split)
-    if not (split_folder / BUILD_FILE).is_file():
-        first_files = leftovers(split_folder / BUILD_FILE)
-        if split_folder.exists() and not (
-            split_folder.is_dir() and first_files >= set(split_folder.iterdir())
-        ):
-            raise BenchmarkError(
-                f"{split_folder} exists and is no built split (no {BUILD_FILE}); name another "
-                "folder"
-            )
-        split_folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(split_folder / BUILD_FILE, json.dumps(data, indent=2) + "\n")
-    existing = read_settings(split_folder / BUILD_FILE)
-    for key, value in data.items():
-        if getattr(existing, key) != value:
-            raise BenchmarkError(
-                f"{split_folder} holds another build: its {key} is {getattr(existing, key)!r}, not "
-                f"{value!r}; name another folder"
-            )
-    write_atomic(split_folder / SPLIT_FILE, text)
 
 
 def _finish(

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from morphgen.errors import FormatError, MorphgenError
+from morphgen.errors import FormatError, MorphgenError, shortened
 from morphgen.files import file_sha256, write_atomic
 from morphgen.formats.data_files import read_json
 
@@ -106,6 +106,50 @@ def write_file(path: Path, content: str | bytes) -> None:
 def leftovers(path: Path) -> set[Path]:
     """Return the temporary folders of writes of a file that were interrupted."""
     return {*path.parent.glob(f".{path.name}.*")}
+
+
+def begin_folder(
+    path: Path,
+    settings: Mapping[str, object],
+    kind: str,
+    error_type: type[MorphgenError] = FormatError,
+    *,
+    first: Mapping[str, str] | None = None,
+) -> None:
+    """Begin a folder by writing the settings that it is made with, or require the same in it.
+
+    So an interrupted run is only continued with equal settings. Traces of one that was killed at
+    its start do not count.
+
+    path: File of the settings in the folder, which is JSON.
+    kind: What the folder holds, for errors.
+    first: Texts of files that are written before, by name.
+    """
+    folder, text = path.parent, json.dumps(settings, indent=2) + "\n"
+    texts = {**(first or {}), path.name: text}
+    if not path.is_file():
+        traces = {file for name in texts for file in leftovers(folder / name)}
+        traces |= {
+            file
+            for name, content in texts.items()
+            if (file := folder / name).is_file() and file.read_bytes() == content.encode()
+        }
+        if folder.exists() and not (folder.is_dir() and traces >= set(folder.iterdir())):
+            raise error_type(
+                f"{folder} exists and is not a {kind} (no {path.name}); name another folder"
+            )
+        with writing(f"to {folder}", error_type):
+            folder.mkdir(parents=True, exist_ok=True)
+            for name, content in texts.items():
+                write_atomic(folder / name, content)
+    stored = read_json(path)
+    for key, value in json.loads(text).items():
+        if not isinstance(stored, dict) or stored.get(key) != value:
+            before = stored.get(key) if isinstance(stored, dict) else None
+            raise error_type(
+                f"{folder} holds another {kind}: its {key} is {shortened(repr(before))}, not "
+                f"{shortened(repr(value))}; name another folder"
+            )
 
 
 @contextmanager

@@ -29,7 +29,7 @@ from morphgen.errors import FormatError, MorphgenError, shortened
 from morphgen.files import write_atomic
 from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.formats.data_files import read_json, read_text
-from morphgen.formats.files import leftovers, locked_folder, naming, replacing_folder, writing
+from morphgen.formats.files import begin_folder, locked_folder, naming, replacing_folder
 from morphgen.formats.records import FiniteNumber
 from morphgen.formats.resolve import portable_uri
 from morphgen.formats.rounding import round_number
@@ -97,7 +97,9 @@ def make_set(config: SetConfig, n: int, work: SetWorker) -> SetReport:
     """
     folders = (config.folder, *config.folder.parents)
     new_folders = [folder for folder in folders if not folder.exists()]
-    _prepare(config)
+    first = {GRAMMAR: config.grammar_text}
+    begin_folder(config.folder / SETTINGS, config.settings(), "set", first=first)
+    _require_same_grammar(config)
     try:
         return _make_robots(config, n, work)
     except MorphgenError:
@@ -250,27 +252,8 @@ def light_urdf(robot: Robot) -> str:
     return urdf_text(robot, lambda mesh: portable_uri(mesh.path))
 
 
-def _prepare(config: SetConfig) -> None:
-    """Create the folder, or require that it holds a set with the same settings."""
-    path = config.folder / SETTINGS
-    settings = config.settings()
-    if not path.exists():
-        if config.folder.exists() and not _is_barely_begun(config):
-            raise FormatError(
-                f"{config.folder} exists and is not a set (no {SETTINGS}); name another"
-            )
-        with writing(f"to {config.folder}"):
-            config.folder.mkdir(parents=True, exist_ok=True)
-            write_atomic(config.folder / GRAMMAR, config.grammar_text)
-            write_atomic(path, json.dumps(settings, indent=2) + "\n")
-        return
-    existing = read_settings(config.folder)
-    for key, value in settings.items():
-        if existing.get(key) != value:
-            raise FormatError(
-                f"{config.folder} holds another set: its {key} is {existing.get(key)!r}, not "
-                f"{value!r}; name another folder"
-            )
+def _require_same_grammar(config: SetConfig) -> None:
+    """Require the text of the grammar that the set was begun with."""
     before = read_text(config.folder / GRAMMAR, MAX_TEXT)
     if before != config.grammar_text:
         lines = (text.split("\n") for text in (before, config.grammar_text))
@@ -281,15 +264,6 @@ def _prepare(config: SetConfig) -> None:
             f"of its {GRAMMAR} is {shortened(old)!r}, not {shortened(new)!r}; name another folder, "
             "or delete this one"
         )
-
-
-def _is_barely_begun(config: SetConfig) -> bool:
-    """Return whether a folder is empty or has only the first files of an interrupted run."""
-    grammar = config.folder / GRAMMAR
-    first_files = leftovers(grammar) | leftovers(config.folder / SETTINGS)
-    if grammar.is_file() and grammar.read_bytes() == config.grammar_text.encode():
-        first_files.add(grammar)
-    return config.folder.is_dir() and first_files >= set(config.folder.iterdir())
 
 
 def _finished(config: SetConfig) -> dict[int, bytes]:

@@ -27,8 +27,7 @@ from morphgen.errors import TaskError
 from morphgen.files import write_atomic
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import write_bundle
-from morphgen.formats.data_files import read_json
-from morphgen.formats.files import locked_folder, require_writable_folder, writing
+from morphgen.formats.files import begin_folder, locked_folder, require_writable_folder
 from morphgen.grammar.library import Library, default_library
 from morphgen.grammar.robot_source import is_robot_file, resolve_robot
 from morphgen.model.kinematics import joint_limits
@@ -193,12 +192,13 @@ def record(folder: Path, config: RecordingConfig, *, jobs: int = 1, ray: str | N
         read_controller(config.policy_for(task), task)  # raises if the policy is not for the task
     settings = config.as_data(tasks)
     if (folder / INFO).is_file():
-        _begin(folder, settings)  # raises if they are not those of the folder
+        begin_folder(folder / RECORDING, settings, "data set", TaskError)
         shutil.rmtree(folder / SHARDS, ignore_errors=True)  # an interrupted run may have left them
         return folder
     robots = robots_of(config, jobs)
-    _begin(folder, settings)
+    begin_folder(folder / RECORDING, settings, "data set", TaskError)
     with locked_folder(folder):
+        (folder / SHARDS).mkdir(exist_ok=True)
         shards = {robot: _shard(folder, robot) for robot in robots}
         missing = [robots[robot] for robot, shard in shards.items() if not shard.is_file()]
         work = partial(record_robot, folder.resolve(), replace(config, sources=()))
@@ -221,26 +221,6 @@ def record(folder: Path, config: RecordingConfig, *, jobs: int = 1, ray: str | N
 
 def _shard(folder: Path, robot: str) -> Path:
     return folder / SHARDS / f"{robot}.npz"
-
-
-def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Write the settings into a new folder, or require that an old one has the same."""
-    path = folder / RECORDING
-    text = json.dumps(settings, indent=2) + "\n"
-    if not path.is_file():
-        if folder.is_dir() and any(folder.iterdir()):
-            raise TaskError(f"{folder} exists and is no data set (no {RECORDING}); name another")
-        with writing(f"to {folder}", TaskError):
-            (folder / SHARDS).mkdir(parents=True)
-            write_atomic(path, text)
-        return
-    stored = read_json(path)
-    for key, value in json.loads(text).items():
-        if not isinstance(stored, dict) or stored.get(key) != value:
-            raise TaskError(
-                f"{folder} holds other demonstrations: their {key} differ; expected "
-                f"{json.dumps(value)[:200]}; name another folder"
-            )
 
 
 def _on_ray(address: str, work: Callable[[Unit], int], units: Sequence[Unit]) -> Iterator[int]:

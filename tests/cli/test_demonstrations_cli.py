@@ -24,4 +24,4 @@ def test_record_show_and_verify(run, ok, tmp_path):
     assert "changed: mine.txt" in out
     code, _, err = run(*words, "--seed", "1")
     assert code == 2
-    assert "holds other demonstrations: their seed differ" in err
+    assert "holds another data set: its seed is " in err
