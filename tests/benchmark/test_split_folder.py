@@ -235,7 +235,7 @@ def test_other_files_in_place_of_a_build_are_errors(tmp_path, example_split, pla
     (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / place).write_text("mine")
     before = tree(tmp_path)
-    message = r"is no built split \(no build.json\); name another|cannot write"
+    message = r"is not a built split \(no build.json\); name another|cannot write"
     with pytest.raises(BenchmarkError, match=message):
         build_split(example_split, tmp_path, LIBRARY)
     assert tree(tmp_path) == before
