@@ -81,12 +81,21 @@ def show_step(scene: RolloutScene, step: int) -> None:
             drawn.object.set_configuration(track.object.placed_joint.positions(pose))
 
 
+_MOMENTS = 8  # moments of an episode that must be in view
+
+
 def track_area(track: Track) -> tuple[Array, Array]:
-    """Return the lowest and highest corner of a robot with its surroundings at the start [m]."""
+    """Return the lowest and highest corner of a robot with its surroundings [m].
+
+    They hold the motion that is known: that of a recorded episode, and of one that is simulated now
+    its start.
+    """
     points = [np.zeros(3)]
-    for q in (track.robot.home, track.q[0]):
+    every = math.ceil(len(track.q) / _MOMENTS)
+    for q in (track.robot.home, *track.q[::every]):
         points += robot_bounds(track.robot, q)
-    points += [poses[0][:3].astype(np.float64) for poses in track.poses.values()]
+    for poses in track.poses.values():
+        points += [pose[:3].astype(np.float64) for pose in poses[::every]]
     points += [np.array(block.pose.position) for block in track.obstacles]
     return np.min(points, axis=0), np.max(points, axis=0)
 
