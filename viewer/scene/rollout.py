@@ -92,7 +92,7 @@ def track_area(track: Track) -> tuple[Array, Array]:
     """
     points = [np.zeros(3)]
     every = math.ceil(len(track.q) / _MOMENTS)
-    for q in (track.robot.home, *track.q[::every]):
+    for q in [np.array(track.robot.home), *track.q[::every]]:
         points += robot_bounds(track.robot, q)
     for poses in track.poses.values():
         points += [pose[:3].astype(np.float64) for pose in poses[::every]]
