@@ -22,9 +22,9 @@ print({side: statistics[side]["links"] for side in ("train", "test")}, statistic
 # rules of the split's regime.
 audit = split.audit()
 print(f"passed: {audit.passed()}, {len(audit.findings)} findings, {len(audit.accepted)} accepted")
-for neighbour in audit.neighbours:
-    print(f"{neighbour.test}: nearest by {neighbour.measure}: {neighbour.train}", end=" ")
-    print(f"({neighbour.value:.3f})")
+for test, by_measure in audit.nearest.items():
+    for measure, nearest in by_measure.items():
+        print(f"{test}: nearest by {measure}: {nearest.train} ({nearest.value:.3f})")
 
 # %%
 # The same measures for robots of your own choice: 1 means equal, and 0 for the distance `tree`.

@@ -142,12 +142,13 @@ def begin_folder(
             folder.mkdir(parents=True, exist_ok=True)
             for name, content in texts.items():
                 write_atomic(folder / name, content)
-    stored = read_json(path)
-    for key, value in json.loads(text).items():
-        if not isinstance(stored, dict) or stored.get(key) != value:
-            before = stored.get(key) if isinstance(stored, dict) else None
+    stored, wanted = read_json(path), json.loads(text)
+    if not isinstance(stored, dict) or not stored.keys() >= wanted.keys():
+        raise FormatError(f"{path}: expected the settings of a {kind}: {', '.join(wanted)}")
+    for key, value in wanted.items():
+        if stored[key] != value:
             raise error_type(
-                f"{folder} holds another {kind}: its {key} is {shortened(repr(before))}, not "
+                f"{folder} holds another {kind}: its {key} is {shortened(repr(stored[key]))}, not "
                 f"{shortened(repr(value))}; name another folder"
             )
 

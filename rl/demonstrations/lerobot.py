@@ -338,10 +338,7 @@ def _write_json(path: Path, data: object) -> None:
 
 def read_index(folder: Path) -> list[dict[str, Any]]:
     """Return the rows of the robots, which ``robot_index`` refers to."""
-    path = folder / INDEX
-    if not path.is_file():  # its name in the first data sets
-        path = path.with_name("index.jsonl")
-    return [parse_json(line, INDEX) for line in read_text(path).splitlines()]
+    return [parse_json(line, INDEX) for line in read_text(folder / INDEX).splitlines()]
 
 
 def read_episodes(folder: Path) -> Iterator[dict[str, Any]]:

@@ -309,7 +309,7 @@ def test_processes_give_the_same_bytes(folder, tmp_path):
 
 
 def test_a_folder_of_something_else_is_refused(folder, tmp_path):
-    with pytest.raises(TaskError, match="their seed differ"):
+    with pytest.raises(TaskError, match="its seed is 0, not 1"):
         record(folder, config(noise=0.2, seed=1))
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(TaskError, match=r"no recording\.json"):
