@@ -11,7 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, overload
 
-from morphgen.arguments import checked_signature, path_argument, truth, whole_number
+from morphgen.arguments import checked_signature, path_argument, text_argument, truth, whole_number
 from morphgen.benchmark.audit import Audit, audit_with_goals
 from morphgen.benchmark.generate import (
     SplitRequest,
@@ -39,24 +39,24 @@ from morphgen.grammar.library import Library, LibraryFolders, default_library
 from morphgen.model.robot import Robot
 from morphgen.progress import part_of
 from morphgen.splits.split import HOLD_OUT, REGIMES, Regime, Split, compose_side
-from morphgen.splits.split_file import require_split_name, split_paths, write_new_splits
-from morphgen.tasks.goals.split_goals import sample_split_goals
-from morphgen.tasks.registry import TASKS
-from morphgen.tasks.scenes.env_specs import GoalConfig
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-
-from morphgen.arguments import text_argument
-from morphgen.splits.split_file import split_names
+from morphgen.splits.split_file import (
+    require_split_name,
+    split_names,
+    split_paths,
+    write_new_splits,
+)
 from morphgen.tables import table
 from morphgen.tasks.goals.split_goals import (
     GoalResult,
     goal_record,
     sample_robot_goals,
+    sample_split_goals,
 )
-from morphgen.tasks.scenes.env_specs import load_robot
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.scenes.env_specs import GoalConfig, load_robot
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 
 @dataclass(frozen=True)
@@ -484,7 +484,7 @@ def _several(key: str, names: Names) -> tuple[str, ...]:
     return texts
 
 
-HEADERS = ("robot", "side", "task", "goals", "acceptance", "obstacles", "certified")
+_HEADERS = ("robot", "side", "task", "goals", "acceptance", "obstacles", "certified")
 
 
 @dataclass(frozen=True, eq=False)
@@ -513,7 +513,7 @@ class GoalSets:
 
     def __str__(self) -> str:
         """Return a table with a row per robot, then a line per failure."""
-        lines = [table([_row(each) for each in self.results], HEADERS)]
+        lines = [table([_row(each) for each in self.results], _HEADERS)]
         for result in self.results:
             robot = f"{result.side} robot" if result.side else "robot"
             if result.goals is None:
