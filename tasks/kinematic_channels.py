@@ -32,6 +32,7 @@ from morphgen.model.kinematics_torch import (
     rotvec_from_matrix,
     solve_ik,
 )
+from morphgen.tasks.clearance import capsule_box_distance, compile_capsules
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.scenes.robot_tables import RobotTables
 
@@ -168,6 +169,10 @@ ROTATION_LENGTH = 0.3
 DAMPING = 0.03
 """Damping of the least squares of ``dls``, in units of the Jacobian's singular values [m/rad]."""
 
+CLEARANCES = (0.05, 0.25)
+"""Distances of links from obstacles that count as far, for contacts and for detours [m]."""
+MAX_CLOSENESS = 1.5  # bound of the observed closeness, for penetrations
+
 
 @dataclass(frozen=True, eq=False)
 class _State:
@@ -229,6 +234,12 @@ class KinematicChannels:
         logarithm of the tool's distance from the target there. Paths are planned on the CPU: on a
         GPU this channel alone copies tensors from it.
 
+    ``clearance`` (3)
+        How near the links that the joint moves are to the obstacles (``clearance``): 1 in contact
+        and 0 far away, for two distances that count as far, and more than 1 in penetration; and
+        the change of the distance by the joint's largest step, faded out likewise. All are zero
+        without obstacles.
+
     Links without an independent joint have zeros, except in ``poses``.
     """
 
@@ -239,11 +250,15 @@ class KinematicChannels:
         names: Sequence[str],
         *,
         has_object: torch.Tensor | None,
+        obstacles: torch.Tensor,
+        obstacle_sizes: torch.Tensor,
         space_of: Callable[[int], FreeSpace],
     ) -> None:
         """Gather the tables of every environment; ``space_of`` returns its scene.
 
         ``has_object`` says which scenes have an object, (n,), bool; None leaves its columns out.
+        ``obstacles`` are the current poses of boxes, (n, O, 7), which the caller updates in place;
+        ``obstacle_sizes`` are their edges (n, O, 3) [m], zero for padding.
         """
         index = env_robot_index
         self._names, self._index, self._tables = tuple(names), index, tables
@@ -262,6 +277,16 @@ class KinematicChannels:
         self._ancestors, tokens = tables.ancestors[index], tables.tokens[index]
         self._half_extents = _half_extents(tokens[..., GEOMETRY.columns])
         self._shape_pose = tokens[..., SHAPE_POSE.columns]
+        self._obstacles, self._box_halves = obstacles, obstacle_sizes[:, None] / 2
+        if "clearance" in names:
+            capsules = compile_capsules(tables.robots, tables.device)
+            self._capsule_link, self._capsule_radius = capsules.link[index], capsules.radius[index]
+            self._capsule_ends = capsules.ends[index]
+            rows = torch.arange(len(index), device=tables.device)[:, None]
+            above = self._ancestors[rows, self._capsule_link]
+            self._moves_capsule = torch.gather(
+                above, 2, self._link_of_joint[:, None].expand(-1, above.shape[1], -1)
+            )
 
     def begin(self, mask: torch.Tensor) -> None:
         """Note that episodes begin in some environments, shape (n,), bool."""
@@ -281,6 +306,7 @@ class KinematicChannels:
             "jacobian": self._jacobian,
             "dls": self._dls,
             "ik": self._ik,
+            "clearance": self._clearance,
         }
         return {name: channels[name](state) for name in self._names}
 
@@ -417,13 +443,56 @@ class KinematicChannels:
         link = torch.where(has_shape, distance, torch.inf).argmin(dim=1)
         point = points[rows, link]
 
-        origins, axes = joint_axes(self._tree, self._index, T_root_link)
-        at_joint = rows[:, None], self._link_of_joint
-        axis, lever = axes[at_joint], point[:, None] - origins[at_joint]
-        prismatic = self._is_prismatic[..., None] > 0
-        columns = torch.where(prismatic, axis, torch.linalg.cross(axis, lever))
+        columns = self._point_columns(state, point[:, None])
         moves = torch.gather(self._ancestors[rows, link], 1, self._link_of_joint)
         return point, (columns * moves[..., None]).transpose(1, 2)
+
+    def _point_columns(self, state: _State, points: torch.Tensor) -> torch.Tensor:
+        """Return the velocities (n, J, 3) of points (n, J or 1, 3) by unit joint velocities."""
+        origins, axes = joint_axes(self._tree, self._index, state.T_root_link)
+        at_joint = torch.arange(len(points), device=points.device)[:, None], self._link_of_joint
+        axis, lever = axes[at_joint], points - origins[at_joint]
+        prismatic = self._is_prismatic[..., None] > 0
+        return torch.where(prismatic, axis, torch.linalg.cross(axis, lever))
+
+    def _clearance(self, state: _State) -> torch.Tensor:
+        distance, point, normal = self._box_distances(state)
+        distance = torch.where(self._moves_capsule, distance[..., None], torch.inf)
+        distance, nearest = distance.min(dim=1)
+        nearest = nearest[..., None].expand(-1, -1, 3)
+        columns = self._point_columns(state, torch.gather(point, 1, nearest))
+        rate = (columns * torch.gather(normal, 1, nearest)).sum(dim=-1)
+        closeness = [(1 - distance / limit).clamp(0, MAX_CLOSENESS) for limit in CLEARANCES]
+        rate = COLUMN_SCALE * rate * self._max_step * closeness[-1]
+        return self._at_links(torch.stack([*closeness, rate], dim=-1))
+
+    def _box_distances(self, state: _State) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the distances (n, S) [m] of capsules from the nearest obstacle, inf without one.
+
+        Returns also the nearest points on the capsules' axes and the directions from the obstacle,
+        in the root frame, both (n, S, 3).
+        """
+        rows = torch.arange(len(state.q), device=state.q.device)[:, None]
+        T_root_link = state.T_root_link[rows, self._capsule_link][:, :, None]
+        ends = (T_root_link[..., :3, :3] @ self._capsule_ends[..., None]).squeeze(-1)
+        ends = ends + T_root_link[..., :3, 3]
+        if not self._obstacles.shape[1]:
+            return torch.full_like(ends[..., 0, 0], torch.inf), ends[..., 0, :], ends[..., 0, :]
+        R_root_box = matrix_from_quaternion(self._obstacles[..., 3:])[:, None]
+        centres = self._obstacles[:, None, :, None, :3]
+        local = (ends[:, :, None] - centres) @ R_root_box  # row vectors: by the inverse
+        halves = self._box_halves
+        distance, point, normal = capsule_box_distance(
+            local, self._capsule_radius[..., None], halves
+        )
+        distance, nearest = torch.where(halves[..., 0] > 0, distance, torch.inf).min(dim=2)
+        nearest = nearest[..., None, None].expand(-1, -1, 1, 3)
+        vectors = torch.stack([point, normal], dim=3) @ R_root_box.transpose(-1, -2)
+        point, normal = (
+            torch.gather(each, 2, nearest).squeeze(2)
+            for each in (vectors[..., 0, :] + centres[..., 0, :], vectors[..., 1, :])
+        )
+        return distance, point, normal
 
     def _at_joints(self, vectors: torch.Tensor) -> torch.Tensor:
         """Repeat vectors (n, k) for every independent joint, shape (n, k, J)."""

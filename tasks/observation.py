@@ -64,6 +64,8 @@ class ObservationConfig:
     ik: bool = False
     """Whether to observe the straight path to a configuration that reaches the target. It is
     planned on the CPU: steps of a batch on a GPU then wait for copies."""
+    clearance: bool = False
+    """Whether to observe how near the links that a joint moves are to obstacles."""
     tree: bool = False
     """Whether to observe how the actuated joints are connected; see ``tree_entries``."""
     state: bool = True
@@ -245,6 +247,7 @@ class EpisodeLayouts:
         specs: Specification of each environment.
         poses: Current poses of the obstacles in the world, shape (n, O, 7); zeros where an
             environment has fewer than O. Updated in place.
+        sizes: Edge lengths of the obstacles, shape (n, O, 3) [m]; zeros where it has fewer.
         entries: Observation of the obstacles, ``obstacles`` and ``obstacle_mask``; all padding if
             the state is not observed. Updated in place.
         current: Layout of each environment, an index of ``GoalSet.layouts``, shape (n,), int64; -1
@@ -272,10 +275,11 @@ class EpisodeLayouts:
         self._has_obstacles = has_obstacles
         self.current = torch.where(has_obstacles, self._first, -1)
         self.entries = obstacle_tokens(scenes, observe.obstacles, device)
+        num_obstacles = max(len(scene.obstacles) for scene in scenes)
+        self.sizes = self.entries["obstacles"][:, :num_obstacles, 10:].clone()
         self._is_observed = observe.state
         if not observe.state:
             self.entries = {name: torch.zeros_like(v) for name, v in self.entries.items()}
-        num_obstacles = max(len(scene.obstacles) for scene in scenes)
         self._layout_poses = _layout_poses(specs, num_obstacles).to(device)
         self.poses = torch.zeros(len(scenes), num_obstacles, 7, device=device)
         self._place()
@@ -469,6 +473,8 @@ class BatchObservation:
                 index,
                 names,
                 has_object=has_object if config.objects or bool(has_object.any()) else None,
+                obstacles=layouts.poses,
+                obstacle_sizes=layouts.sizes,
                 space_of=layouts.space,
             )
         self._points: PointClouds | None = None
