@@ -35,10 +35,14 @@ def print_summary(args: argparse.Namespace, demos: Demonstrations) -> None:
         "tasks": [asdict(each) for each in summarize(demos)],
     }
     head = (
-        f"{demos.folder}: {data['episodes']:,} episodes of {data['robots']:,} robots, "
-        f"{data['steps']:,} steps, {size / 1e6:,.1f} MB"
+        f"{demos.folder}: {_counted(len(demos.episodes), 'episode')} of "
+        f"{_counted(len(demos.robot_hashes), 'robot')}, {len(demos):,} steps, {size / 1e6:,.1f} MB"
     )
     opt.print_result(args, data, lambda: f"{head}\n{summary_text(demos)}")
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number:,} {what}{'s' * (number != 1)}"
 
 
 def clone(args: argparse.Namespace) -> None:

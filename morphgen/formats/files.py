@@ -147,10 +147,27 @@ def begin_folder(
         raise FormatError(f"{path}: expected the settings of a {kind}: {', '.join(wanted)}")
     for key, value in wanted.items():
         if stored[key] != value:
+            name, old, new = _first_difference(key, stored[key], value)
             raise error_type(
-                f"{folder} holds another {kind}: its {key} is {shortened(repr(stored[key]))}, not "
-                f"{shortened(repr(value))}; name another folder"
+                f"{folder} holds another {kind}: its {name} is {shortened(repr(old))}, not "
+                f"{shortened(repr(new))}; name another folder"
             )
+
+
+def _first_difference(name: str, old: object, new: object) -> tuple[str, object, object]:
+    """Return the name and the values of the first entries of two JSON values that differ."""
+    match old, new:
+        case dict(), dict():
+            names = [(f"{name}.{key}", key) for key in old if key in new and old[key] != new[key]]
+        case list(), list():
+            pairs = enumerate(zip(old, new, strict=False))
+            names = [(f"{name}[{i}]", i) for i, (a, b) in pairs if a != b]
+        case _:
+            return name, old, new
+    if not names:  # one has more entries
+        return name, old, new
+    path, key = names[0]
+    return _first_difference(path, old[key], new[key])
 
 
 @contextmanager

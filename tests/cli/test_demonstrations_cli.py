@@ -11,7 +11,7 @@ pytestmark = pytest.mark.usefixtures("goal_cache")
 def test_record_show_and_verify(run, ok, tmp_path):
     words = ("record", "prims", "--tasks", "reach", "--episodes", "1", "--out", "demos")
     first, _, _, row, *_ = ok(*words).splitlines()
-    assert first.startswith("demos: 1 episodes of 1 robots, ")
+    assert first.startswith("demos: 1 episode of 1 robot, ")
     assert row.split()[:4] == ["reach", "ik", "1", "1"]
     assert ok(*words).splitlines()[0] == first  # finished: nothing is recorded again
     assert ok("show", "demos").splitlines()[0] == first
@@ -25,3 +25,6 @@ def test_record_show_and_verify(run, ok, tmp_path):
     code, _, err = run(*words, "--seed", "1")
     assert code == 2
     assert "holds another data set: its seed is " in err
+    code, _, err = run("record", "stick", *words[2:])
+    assert code == 2
+    assert "its robots[0].name is 'prims', not 'stick'; name another folder" in err
