@@ -15,7 +15,10 @@ from morphgen.arguments import checked_signature, require_types
 from morphgen.benchmark.split_folder import read_split_or_folder
 from morphgen.encoding.tokens import default_max_links, require_max_links
 from morphgen.errors import BenchmarkError, TaskError
+from morphgen.formats.description import SUFFIXES
 from morphgen.grammar.library import LibraryFolders, library_folders
+from morphgen.grammar.robot_set import GRAMMAR
+from morphgen.grammar.robot_source import is_robot_folder, is_set_folder
 from morphgen.processes import usable_cores
 from morphgen.progress import note
 from morphgen.rl.agents import AGENTS, ME_GRAPH, preset_of
@@ -261,8 +264,14 @@ def named_source(given: SimpleNamespace, side: Side = "train") -> SplitSource | 
             goal_seed=given.goal_seed or 0,
             library=folders,
         )
-    if len(words) > 1 or "=" in text:
+    path = Path(text)
+    if len(words) > 1 or "=" in text or is_robot_folder(path) or path.suffix in SUFFIXES:
         raise TaskError(f"{text}: a robot needs its task, {_task_choices()}")
+    if is_set_folder(path):
+        raise TaskError(
+            f"{text} is a set of robots; expected a split, such as one that morphgen split new "
+            f"interpolation --grammar {path / GRAMMAR} makes"
+        )
     if given.obstacles:
         raise TaskError("--obstacles is for one robot; a split says which robots have obstacles")
     try:

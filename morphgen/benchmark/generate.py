@@ -256,7 +256,7 @@ def interpolation(
         raise BenchmarkError(f"--hull {hull}: unknown{nearest(hull, HULLS)}")
     train = RobotStream.of(grammar, grammar.name, request)
     test = RobotStream.of(grammar, f"{grammar.name}-test", request)
-    where = {"inside": "within their hull", "outside": "outside their hull", "any": "besides"}
+    where = {"inside": "within their hull", "outside": "outside their hull", "any": "more"}
     advice = {
         "inside": "ask for more train robots, or for --hull any",
         "outside": "ask for fewer train robots, or for --hull any",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from importlib.metadata import version
@@ -87,7 +88,7 @@ from morphgen.formats.files import require_writable_file, require_writable_folde
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding
 from morphgen.rl.baselines import BASELINES
-from morphgen.splits.split import HOLD_OUT, SIDES, Split, split_id
+from morphgen.splits.split import HOLD_OUT, REGIMES, SIDES, Split, split_id
 from morphgen.splits.split_file import read_split, split_names, split_paths, write_new_splits
 from morphgen.tables import table
 from morphgen.tasks.goals.split_goals import GoalResult, sample_split_goals
@@ -349,7 +350,10 @@ def _stats_row(
 def new(args: argparse.Namespace) -> None:
     """Choose the robots, write the splits and print what they are."""
     if args.subcommand is None and not args.hold_out:
-        args.parser.error("the following arguments are required: --hold-out, or COMMAND")
+        regimes = ", ".join(regime for regime in REGIMES if regime != HOLD_OUT)
+        args.parser.error(
+            f"name what to hold out, such as --hold-out 'arm=kinova*', or a regime: {regimes}"
+        )
     choice = opt.given(args, NewSplit.__annotations__)
     choice["regime"] = args.subcommand or HOLD_OUT
     train = args.train
@@ -379,7 +383,8 @@ def new(args: argparse.Namespace) -> None:
     lines += _hold_out_notes(splits[-1], library)  # the largest has all train robots
     if limits := restriction_line(parts[-1]):  # of the largest split
         lines.append(f"  {limits}")
-    lines.append(f"next: morphgen split audit {paths[-1]}")
+    folders = [word for folder in args.library for word in ("--library", str(folder))]
+    lines.append(f"next: {shlex.join(['morphgen', 'split', 'audit', str(paths[-1]), *folders])}")
     opt.print_result(args, data, lambda: "\n".join(lines))
 
 

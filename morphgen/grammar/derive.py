@@ -318,7 +318,7 @@ def require_part(item: Item, grammar: Grammar, library: Library) -> Manifest:
         valid = [*(production.symbol for production in grammar.productions), *library.paths]
         raise GrammarError(
             f"{item.location}: {item.name!r} is neither a symbol nor a part"
-            + nearest(item.name, valid)
+            + library.nearest_part(item.name, valid)
         )
     return library.manifest(item.name)
 

@@ -45,14 +45,18 @@ class Library:
                 paths[path.stem] = path
         return dict(sorted(paths.items()))
 
+    def nearest_part(self, name: str, valid: Iterable[str]) -> str:
+        """Return the hint for an unknown name of a part, with what own parts need."""
+        hint = nearest(name, valid)
+        if self.folders != shipped_folders():
+            return hint
+        return f"{hint}{'' if hint.endswith('?') else ';'} your own parts need --library DIR"
+
     def manifest(self, name: str, kind: PartKind | None = None) -> Manifest:
         """Return the manifest of a part."""
         if name not in self.paths:
             valid = self.names(kind) if kind else self.paths
-            hint = nearest(name, valid)
-            if self.folders == shipped_folders():
-                hint += "; your own parts need --library DIR"
-            raise PartError(f"unknown {kind or 'part'} {name!r}{hint}")
+            raise PartError(f"unknown {kind or 'part'} {name!r}{self.nearest_part(name, valid)}")
         manifest = _manifest(self.paths[name])
         if kind is not None and manifest.kind != kind:
             raise PartError(

@@ -42,6 +42,7 @@ REFUSALS = """
 compose arm=ur55 ee=plane => unknown arm 'ur55'; did you mean 'ur5'?
 compose arm=ur5 ee=plnae => unknown ee 'plnae'; did you mean 'plane'?
 compose arm=ur55 ee=plane => ; your own parts need --library DIR
+compose arm=ur5 ee=stik => 'stick'? your own parts need --library DIR
 compose arm=bob66 ee=plane => unknown arm 'bob66'; 42 are valid, such as arm3, arm5
 compose base=gantri arm=ur5 => unknown base 'gantri'; did you mean 'gantry'?
 compose base=gantry ee=plane ee.sise=1 => no parameter 'sise'; did you mean 'size'? valid: mo
@@ -152,7 +153,7 @@ check a --strct => unknown option '--strct'; did you mean '--strict'?
 check a --strct => ; see morphgen check --help
 list arms legs => unknown arguments: legs; see morphgen list --help
 split => the following arguments are required
-split new => are required: --hold-out, or COMMAND; see
+split new => --hold-out 'arm=kinova*', or a regime: interpolation, composition, extrapolation; see
 split new interpolation => the following arguments are required
 EXTRAPOLATION stick,nlnk --test-category chain => 'nlnk'; did you mean 'nlink'?
 EXTRAPOLATION stick, --test-category chain => unknown grammar ''
@@ -205,6 +206,8 @@ train --envs x => argument --envs: x: expected a whole number, 1 or more; see mo
 train interpolation/arm3/reech => did you mean 'interpolation/arm3/reach'?
 train planar-cube => a robot needs task=reach or task=push
 train base=planar ee=cube => a robot needs its task
+train arm.urdf => arm.urdf: a robot needs its task, task=reach or
+train begun => begun is a set of robots; expected a split, such as one that morphgen split new
 train planar-cube task=dance => unknown task 'dance'; valid: TASKS
 train interpolation/arm3/reach --obstacles => --obstacles is for one robot
 train interpolation/arm3/reach --envs 9 => fewer than the 10 robots

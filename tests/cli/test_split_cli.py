@@ -73,7 +73,7 @@ def test_new_prints_a_summary_and_the_next_command(run, tmp_path):
     name = "interpolation-cubes-reach-seed4"
     assert (code, err) == (0, "")
     assert out.splitlines() == [
-        f"{name}.yaml: 3 robots of cubes; test: 1 besides",
+        f"{name}.yaml: 3 robots of cubes; test: 1 more",
         "  test: cubes-test-000000",
         f"next: morphgen split audit {name}.yaml",
     ]

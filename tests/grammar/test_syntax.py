@@ -631,6 +631,7 @@ def test_shipped_grammars_are_sound(name):
     ("lines", "message"),
     [
         (["robot -> fixed urr5"], "g:1:16: 'urr5' is neither a symbol nor a part; did you mean"),
+        (["robot -> fixed my_arm"], "your own parts need --library DIR"),
         (["robot -> fixed a(x=1)", "a -> ur5"], "g:1:16: 'a' is a symbol and takes no parameters"),
         (["robot -> gantry plane(sise=1)"], "g:1:28: 'plane' has no parameter 'sise'"),
         (["robot -> gantry plane(size=1kg)"], "g:1:28: size is in m, 1kg in kg"),
