@@ -22,6 +22,8 @@ if TYPE_CHECKING:  # tqdm is loaded when a bar is drawn
     from morphgen.rl.distributed import UpdateMetrics
     from morphgen.rl.runs.training import ShowMetrics, Subrun
 
+    ShowUpdate = Callable[[UpdateMetrics, int, Mapping[str, str]], None]
+
 T = TypeVar("T")
 
 FIRST_LINE = 2.0
@@ -273,7 +275,7 @@ class TrainingProgress(_StagedBar):
                 dynamic_ncols=True,
             )
             self._shown.callback(shown.close)
-            show = partial(_draw_update, shown)
+            show = partial(_draw_update, shown, show)
 
         def update(report: UpdateMetrics, total: int) -> None:
             counts.update(episodes=report.episodes, diverged=report.unstable)
@@ -287,16 +289,24 @@ class TrainingProgress(_StagedBar):
 
 
 def _draw_update(
-    shown: tqdm[NoReturn], report: UpdateMetrics, total: int, facts: Mapping[str, str]
+    shown: tqdm[NoReturn],
+    print_update: ShowUpdate,
+    report: UpdateMetrics,
+    total: int,
+    facts: Mapping[str, str],
 ) -> None:
     if shown.n == 0:  # a resumed run: the bar begins where the run was interrupted
         shown.initial = report.transitions - report.transitions // report.update
         shown.n = shown.initial
-    shown.set_postfix(facts, refresh=False)
+    shown.set_postfix(
+        dict(reversed([*facts.items()])), refresh=False
+    )  # narrow terminals cut scores
     shown.update(report.transitions - shown.n)
+    if report.update == total:
+        print_update(report, total, facts)
 
 
-def _update_lines(name: str) -> Callable[[UpdateMetrics, int, Mapping[str, str]], None]:
+def _update_lines(name: str) -> ShowUpdate:
     """Return a function that prints the first update, the last one, and others at intervals."""
     last = -math.inf
 

@@ -7,6 +7,7 @@ import itertools
 import json
 import math
 import tempfile
+from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -107,7 +108,7 @@ def print_grammar(args: argparse.Namespace) -> None:
 
 
 MAX_LISTED = 3
-"""Largest number of robots with the body of another one that are printed; ``--json`` has all."""
+"""Largest number of reasons, and of robots with the body of another one, that are printed."""
 
 
 def sample(args: argparse.Namespace) -> None:
@@ -131,9 +132,12 @@ def sample(args: argparse.Namespace) -> None:
 
     def summary() -> str:
         lines = [f"{folder}: {report.made} robots written, {report.kept} already existed"]
-        # The most frequent reason comes first.
-        rejected = sorted(report.rejected.items(), key=lambda entry: -entry[1])
-        lines += [f"  {times} draws rejected: {reason}" for reason, times in rejected]
+        rejected = Counter(report.rejected)
+        draws = report.made + report.kept + rejected.total()
+        for reason, times in rejected.most_common(MAX_LISTED):
+            lines.append(f"  {times} of {draws} draws rejected: {reason}")
+        if others := sum(times for _, times in rejected.most_common()[MAX_LISTED:]):
+            lines.append(f"  {others} rejected for other reasons; --json has all")
         if twins := [f"{name} as {same}" for name, same in report.duplicates]:
             number = f"{len(twins)} robot{' has' if len(twins) == 1 else 's have'}"
             more = ", ..." if len(twins) > MAX_LISTED else ""

@@ -218,15 +218,18 @@ def tokens(args: argparse.Namespace) -> None:
         for robot in track(robots, args, "computing tokens", "robot", len(robots))
     ]
     data = [_data(*pair, max_links) for pair in zip(robots, tables, strict=True)]
-    lines = [_tokens_text(*pair, max_links) for pair in zip(robots, tables, strict=True)]
-    if args.layout:
-        lines.append(f"\n{_layout_text()}")
     if args.out:
         names = [link.name for link in robots[0].links]
         write_file(args.out, tokens_npz(tables[0], names, robots[0].name, max_links))
         data[0]["file"] = str(args.out)
-        lines.append(str(args.out))
-    opt.print_result(args, data[0] if len(data) == 1 else data, lambda: "\n".join(lines))
+
+    def text() -> str:
+        lines = [_tokens_text(*pair, max_links) for pair in zip(robots, tables, strict=True)]
+        if args.layout:
+            lines.append(f"\n{_layout_text()}")
+        return "\n".join([*lines, str(args.out)] if args.out else lines)
+
+    opt.print_result(args, data[0] if len(data) == 1 else data, text)
 
 
 def _data(robot: Robot, tokens: Array, max_links: int) -> dict[str, object]:

@@ -188,5 +188,5 @@ def _build_if_valid(
     findings = check(robot, home_tested=True)
     for finding in findings:
         if finding.severity != "info":
-            return f"check {finding.code}"
+            return f"check {finding.code}, {finding.where}"
     return robot, properties, findings

@@ -62,7 +62,14 @@ def test_list_prints_one_row_per_part(ok):
 
 
 @pytest.mark.parametrize(
-    "words", [["list", "arms"], ["split", "list"], ["grammar", "list"], ["conform", "gantry-plane"]]
+    "words",
+    [
+        ["list", "arms"],
+        ["split", "list"],
+        ["grammar", "list"],
+        ["conform", "gantry-plane"],
+        ["tokens", "gantry-plane"],
+    ],
 )
 def test_tables_fit_the_terminal(words, ok, monkeypatch):
     piped = ok(*words)
