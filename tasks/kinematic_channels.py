@@ -171,6 +171,7 @@ DAMPING = 0.03
 
 CLEARANCES = (0.05, 0.25)
 """Distances of links from obstacles that count as far, for contacts and for detours [m]."""
+MAX_PLACE = 3.0  # bound of the observed place on the object [half edges]
 MAX_CLOSENESS = 1.5  # bound of the observed closeness, for penetrations
 
 
@@ -239,6 +240,10 @@ class KinematicChannels:
         and 0 far away, for two distances that count as far, and more than 1 in penetration; and
         the change of the distance by the joint's largest step, faded out likewise. All are zero
         without obstacles.
+    ``contact`` (9)
+        The same for the box of the object, from the nearest link that the joint moves: the three
+        numbers of ``clearance``, the direction from the box to the link in the root frame, and
+        where the link is on the box, in half edges. All fade out like the change of the distance.
 
     Links without an independent joint have zeros, except in ``poses``.
     """
@@ -252,6 +257,7 @@ class KinematicChannels:
         has_object: torch.Tensor | None,
         obstacles: torch.Tensor,
         obstacle_sizes: torch.Tensor,
+        object_boxes: torch.Tensor,
         space_of: Callable[[int], FreeSpace],
     ) -> None:
         """Gather the tables of every environment; ``space_of`` returns its scene.
@@ -259,6 +265,7 @@ class KinematicChannels:
         ``has_object`` says which scenes have an object, (n,), bool; None leaves its columns out.
         ``obstacles`` are the current poses of boxes, (n, O, 7), which the caller updates in place;
         ``obstacle_sizes`` are their edges (n, O, 3) [m], zero for padding.
+        ``object_boxes`` are edges and centres of ``Scene.object_box``, (n, 2, 3) [m], or zeros.
         """
         index = env_robot_index
         self._names, self._index, self._tables = tuple(names), index, tables
@@ -277,8 +284,9 @@ class KinematicChannels:
         self._ancestors, tokens = tables.ancestors[index], tables.tokens[index]
         self._half_extents = _half_extents(tokens[..., GEOMETRY.columns])
         self._shape_pose = tokens[..., SHAPE_POSE.columns]
-        self._obstacles, self._box_halves = obstacles, obstacle_sizes[:, None] / 2
-        if "clearance" in names:
+        self._obstacles, self._obstacle_halves = obstacles, obstacle_sizes / 2
+        self._object_halves, self._object_centres = object_boxes[:, 0] / 2, object_boxes[:, 1]
+        if {"clearance", "contact"} & {*names}:
             capsules = compile_capsules(tables.robots, tables.device)
             self._capsule_link, self._capsule_radius = capsules.link[index], capsules.radius[index]
             self._capsule_ends = capsules.ends[index]
@@ -307,6 +315,7 @@ class KinematicChannels:
             "dls": self._dls,
             "ik": self._ik,
             "clearance": self._clearance,
+            "contact": self._contact,
         }
         return {name: channels[name](state) for name in self._names}
 
@@ -456,32 +465,57 @@ class KinematicChannels:
         return torch.where(prismatic, axis, torch.linalg.cross(axis, lever))
 
     def _clearance(self, state: _State) -> torch.Tensor:
-        distance, point, normal = self._box_distances(state)
+        near, _, _ = self._nearness(state, self._obstacles, self._obstacle_halves)
+        return self._at_links(near)
+
+    def _contact(self, state: _State) -> torch.Tensor:
+        pose, half = state.object_pose, self._object_halves
+        R = matrix_from_quaternion(pose[:, 3:])
+        centre = pose[:, :3] + (R @ self._object_centres[..., None]).squeeze(-1)
+        box = torch.cat([centre, pose[:, 3:]], dim=1)[:, None]
+        near, point, normal = self._nearness(state, box, half[:, None])
+        # Row vectors: by the inverse rotation. At a face's middle one number is 1 or -1.
+        place = (point - centre[:, None]) @ R / half[:, None].clamp(min=NEAR)
+        fade = near[..., 1:2]
+        columns = [near, normal * fade, place.clamp(-MAX_PLACE, MAX_PLACE) * fade]
+        return self._at_links(torch.cat(columns, dim=-1))
+
+    def _nearness(
+        self, state: _State, boxes: torch.Tensor, halves: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return how near the links that joints move are to boxes, (n, J, 3); see ``clearance``.
+
+        Boxes have poses (n, B, 7) and half edges (n, B, 3), zero for padding. Returns also the
+        nearest points on the axes of capsules, and the directions from the boxes, (n, J, 3).
+        """
+        distance, point, normal = self._box_distances(state, boxes, halves)
         distance = torch.where(self._moves_capsule, distance[..., None], torch.inf)
         distance, nearest = distance.min(dim=1)
         nearest = nearest[..., None].expand(-1, -1, 3)
-        columns = self._point_columns(state, torch.gather(point, 1, nearest))
-        rate = (columns * torch.gather(normal, 1, nearest)).sum(dim=-1)
+        point, normal = torch.gather(point, 1, nearest), torch.gather(normal, 1, nearest)
+        rate = (self._point_columns(state, point) * normal).sum(dim=-1)
         closeness = [(1 - distance / limit).clamp(0, MAX_CLOSENESS) for limit in CLEARANCES]
         rate = COLUMN_SCALE * rate * self._max_step * closeness[-1]
-        return self._at_links(torch.stack([*closeness, rate], dim=-1))
+        return torch.stack([*closeness, rate], dim=-1), point, normal
 
-    def _box_distances(self, state: _State) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return the distances (n, S) [m] of capsules from the nearest obstacle, inf without one.
+    def _box_distances(
+        self, state: _State, boxes: torch.Tensor, halves: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the distances (n, S) [m] of capsules from the nearest box, inf without one.
 
-        Returns also the nearest points on the capsules' axes and the directions from the obstacle,
-        in the root frame, both (n, S, 3).
+        Returns also the nearest points on the capsules' axes and the directions from the box, in
+        the root frame, both (n, S, 3).
         """
         rows = torch.arange(len(state.q), device=state.q.device)[:, None]
         T_root_link = state.T_root_link[rows, self._capsule_link][:, :, None]
         ends = (T_root_link[..., :3, :3] @ self._capsule_ends[..., None]).squeeze(-1)
         ends = ends + T_root_link[..., :3, 3]
-        if not self._obstacles.shape[1]:
+        if not boxes.shape[1]:
             return torch.full_like(ends[..., 0, 0], torch.inf), ends[..., 0, :], ends[..., 0, :]
-        R_root_box = matrix_from_quaternion(self._obstacles[..., 3:])[:, None]
-        centres = self._obstacles[:, None, :, None, :3]
+        R_root_box = matrix_from_quaternion(boxes[..., 3:])[:, None]
+        centres = boxes[:, None, :, None, :3]
         local = (ends[:, :, None] - centres) @ R_root_box  # row vectors: by the inverse
-        halves = self._box_halves
+        halves = halves[:, None]
         distance, point, normal = capsule_box_distance(
             local, self._capsule_radius[..., None], halves
         )

@@ -66,6 +66,8 @@ class ObservationConfig:
     planned on the CPU: steps of a batch on a GPU then wait for copies."""
     clearance: bool = False
     """Whether to observe how near the links that a joint moves are to obstacles."""
+    contact: bool = False
+    """Whether to observe how near those links are to the object, and where."""
     tree: bool = False
     """Whether to observe how the actuated joints are connected; see ``tree_entries``."""
     state: bool = True
@@ -468,6 +470,8 @@ class BatchObservation:
         self._kinematics: KinematicChannels | None = None
         if names := config.kinematic_channels:
             has_object = torch.tensor([scene.object is not None for scene in scenes], device=device)
+            nothing = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            boxes = torch.tensor([scene.object_box or nothing for scene in scenes], device=device)
             self._kinematics = KinematicChannels(
                 robot_tables,
                 index,
@@ -475,6 +479,7 @@ class BatchObservation:
                 has_object=has_object if config.objects or bool(has_object.any()) else None,
                 obstacles=layouts.poses,
                 obstacle_sizes=layouts.sizes,
+                object_boxes=boxes,
                 space_of=layouts.space,
             )
         self._points: PointClouds | None = None

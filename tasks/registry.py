@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from morphgen.tasks.sim.base import Simulator
     from morphgen.tasks.task import Task
 
-KINEMATIC_CHANNELS = ("lag", "joint", "poses", "jacobian", "dls", "ik", "clearance")
+KINEMATIC_CHANNELS = ("lag", "joint", "poses", "jacobian", "dls", "ik", "clearance", "contact")
 """Channels of ``kinematic_channels``, in the order in which networks concatenate them."""
 CollisionGeometry = Literal["primitive", "convex"]
 """Collision shapes of simulated robots. ``primitive``: all primitives. ``convex``: convex pieces of

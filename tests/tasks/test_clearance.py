@@ -1,4 +1,4 @@
-"""The channel `clearance` has the distances and derivatives of the shapes that collide."""
+"""The channels `clearance` and `contact` have distances and derivatives of shapes that collide."""
 
 from dataclasses import replace
 
@@ -14,14 +14,15 @@ from morphgen.errors import TaskError
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere, half_extents
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.tasks.clearance import box_distance, capsule_box_distance, compile_capsules
-from morphgen.tasks.kinematic_channels import CLEARANCES, COLUMN_SCALE
+from morphgen.tasks.kinematic_channels import CLEARANCES, COLUMN_SCALE, MAX_PLACE
 from morphgen.tasks.observation import observation_config
+from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.make import batch_from_specs
 from morphgen.tasks.sim.base import Block
 
 WORDS = ("arm3", "arm=ur5 ee=stick")
-OBSERVE = observation_config(["clearance"])
+OBSERVE = observation_config(["clearance", "contact"])
 NEAR_ERROR, FAR_ERROR = 0.012, 0.036
 """Largest error of distances below `NEAR`, and of others [m]."""
 NEAR = 0.05
@@ -41,12 +42,12 @@ def batch(specs):
     return batch_from_specs(specs, 20, sim="mujoco", observe=OBSERVE, seed=1)
 
 
-def channel(batch, q=None):
-    """Return the channel at the joints, shape (n, J, 3)."""
+def channel(batch, q=None, name="clearance", object_pose=None):
+    """Return a channel at the joints, shape (n, J, size)."""
     q = batch.q if q is None else q
-    object_pose = batch.simulation.object_pose
+    object_pose = batch.simulation.object_pose if object_pose is None else object_pose
     goals = batch.groups.tool_targets(object_pose, 0)
-    values = batch.observation._kinematics(q, q, goals, object_pose)["clearance"]
+    values = batch.observation._kinematics(q, q, goals, object_pose)[name]
     links = batch.robot_tables.link_of_joint[batch.env_robot_index]
     return torch.gather(values, 1, links[..., None].expand(-1, -1, values.shape[2]))
 
@@ -155,6 +156,7 @@ def test_environments_without_obstacles_see_zeros_and_the_others_what_they_see_a
     mixed = batch_from_specs([*specs, free], 6, sim="mujoco", observe=OBSERVE, seed=1)
     observed = mixed.reset()["clearance"]
     assert not observed[2::3].any()
+    assert not mixed.observe()["contact"].any()
     assert not observed[~mixed.observe()["links"]].any()
     for env in (0, 1):
         alone = batch_from_specs(
@@ -182,3 +184,101 @@ def test_meshes_are_refused(specs, tmp_path):
     links = tuple(replace(link, collisions=mesh if i else ()) for i, link in enumerate(robot.links))
     with pytest.raises(TaskError, match=r"clearance: link .* has a mesh"):
         compile_capsules([replace(robot, links=links)], "cpu")
+
+
+@pytest.fixture(scope="module")
+def pushes(cache):
+    robots = [morphgen.compose(words, geometry="primitive") for words in ("arm3-stick", WORDS[1])]
+    push = [draw_spec(robot, PushConfig(num_goals=5), cache=cache) for robot in robots]
+    return batch_from_specs(push, 40, sim="mujoco", observe=OBSERVE, seed=1)
+
+
+@pytest.fixture
+def near(pushes):
+    """Return the batch, and poses of its blocks near the tools."""
+    pushes.reset()
+    random = torch.Generator().manual_seed(0)
+    pose = pushes.simulation.object_pose.clone()
+    tool = pushes.observation.tool_positions(pushes.q)
+    away = torch.nn.functional.normalize(torch.randn(len(pose), 3, generator=random))
+    pose[:, :3] = tool + (0.15 + 0.2 * torch.rand(len(pose), 1, generator=random)) * away
+    pose[:, 3:] = torch.nn.functional.normalize(torch.randn(len(pose), 4, generator=random))
+    return pushes, pose
+
+
+def contact(near, *, q=None, moved=None):
+    batch, pose = near
+    pose = pose.clone()
+    if moved is not None:
+        pose[:, :3] += moved
+    return channel(batch, q, "contact", pose)
+
+
+def test_contact_is_as_near_to_the_block_as_the_collision_shapes(near):
+    batch, poses = near
+    limit, observed, checked = CLEARANCES[-1], contact(near), 0
+    for env in range(batch.num_envs):
+        spec = batch.specs[int(batch.env_robot_index[env])]
+        robot, block = spec.robot, spec.scene.block
+        T = forward_kinematics(robot, batch.q[env, : robot.dof].double().numpy())
+        shapes = [(i, shape) for i, link in enumerate(robot.links) for shape in link.collisions]
+        x, y, z, *quaternion = poses[env].tolist()
+        box = replace(block, pose=Pose((x, y, z), tuple(quaternion)))
+        distances = mujoco_distances([(shape, T[i]) for i, shape in shapes], [box])[:, 0]
+        for joint, k in enumerate(robot.independent_joints):
+            moved = [k in robot.joint_chain(robot.links[i].name) for i, _ in shapes]
+            distance = distances[moved].min()
+            closeness = float(observed[env, joint, 1])
+            if 0 < closeness < 1 and distance > 0:
+                assert abs((1 - closeness) * limit - distance) < FAR_ERROR
+                checked += 1
+    assert checked > 50
+
+
+def test_contact_changes_with_the_joints_and_along_its_direction(near):
+    batch, limit = near[0], CLEARANCES[-1]
+    observed, step = contact(near), batch.robot_tables.max_step[batch.env_robot_index]
+    closeness = observed[..., 1]
+    direction = observed[..., 3:6] / closeness.clamp(min=1e-3)[..., None]
+    seen = (closeness > 0.05) & (closeness < 1)
+    torch.testing.assert_close(
+        torch.linalg.vector_norm(direction[seen], dim=-1), torch.ones(int(seen.sum()))
+    )
+    checked = 0
+    for joint in range(batch.q.shape[1]):
+        change = torch.zeros_like(batch.q)
+        change[:, joint] = 1e-3
+        turned = [contact(near, q=batch.q + sign * change)[:, joint, 1] for sign in (-1, 1)]
+        moved = direction[:, joint] * 1e-3
+        shifted = [contact(near, moved=sign * moved)[:, joint, 1] for sign in (-1, 1)]
+        rate = -(turned[1] - turned[0]) * limit / 2e-3
+        expected = observed[:, joint, 2] / (COLUMN_SCALE * step[:, joint] * closeness[:, joint])
+        # Where the nearest pair changes in between, both ends are farther than the middle says.
+        middle = closeness[:, joint]
+        smooth = [((a + b) / 2 - middle).abs() < 1e-4 for a, b in (turned, shifted)]
+        here = seen[:, joint]
+        both = here & smooth[0]
+        torch.testing.assert_close(expected[both], rate[both], atol=0.02, rtol=0.05)
+        towards = here & smooth[1]
+        change_by_metre = (shifted[1] - shifted[0])[towards] * limit / 2e-3
+        torch.testing.assert_close(
+            change_by_metre, torch.ones_like(change_by_metre), atol=0.02, rtol=0
+        )
+        checked += int(both.sum() + towards.sum())
+    assert checked > 200
+
+
+def test_contact_says_where_the_link_is_on_the_block(near):
+    """The place is as far from the box as the closeness says, but for a capsule's radius."""
+    batch, observed = near[0], contact(near)
+    closeness, limit = observed[..., 1], CLEARANCES[-1]
+    place = observed[..., 6:] / closeness.clamp(min=1e-3)[..., None]
+    seen = (closeness > 0.05) & (closeness < 1) & (place.abs().amax(dim=-1) < MAX_PLACE)
+    for env, joint in torch.nonzero(seen).tolist():
+        spec = batch.specs[int(batch.env_robot_index[env])]
+        half = torch.tensor(spec.scene.block.size) / 2
+        distance, _ = box_distance(place[env, joint] * half, half)
+        radius = float(distance) - (1 - float(closeness[env, joint])) * limit
+        radii = compile_capsules([spec.robot], "cpu").radius[0]
+        assert (radii - radius).abs().min() < 1e-4
+    assert int(seen.sum()) > 50
