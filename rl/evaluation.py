@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 from morphgen.errors import TaskError
 from morphgen.model.kinematics import reach
 from morphgen.progress import part_of, show_progress, stage
-from morphgen.rl.baselines import BASELINES, ZERO, Controller, baselines_for
+from morphgen.rl.baselines import BASELINES, ZERO, Baseline, Controller, baselines_for
 from morphgen.rl.baselines.simple import Random
 from morphgen.rl.config import differences
 from morphgen.rl.inference import Episode, Mode, Policy, PolicyController, run_episodes
@@ -40,6 +41,7 @@ from morphgen.rl.scores import (
 )
 from morphgen.rl.shipped_policies import name_of
 from morphgen.splits.split import Side
+from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, evaluation_simulator
 from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
 from morphgen.tasks.scenes.make import batch_from_specs
@@ -223,23 +225,12 @@ def _run_all(
     rounds, envs_per_robot = _rounds(config)
     simulator = SIMULATORS[config.sim]
     batch_envs = max(simulator.max_envs // len(specs), 1)  # per robot
-    seed = int(np.random.SeedSequence([EVAL_SEED_OFFSET, config.seed]).generate_state(1)[0])
     episodes: list[list[Episode]] = [[] for _ in specs]
     controller: Controller | None = None
     total = envs_per_robot * rounds * len(specs)
     for first in range(0, envs_per_robot, batch_envs):
-        batch = batch_from_specs(
-            specs,
-            min(batch_envs, envs_per_robot - first) * len(specs),
-            first=first * len(specs),
-            sim=config.sim,
-            seed=seed,
-            workers=config.workers,
-            layouts="eval",
-            device=simulator.devices[0],
-            library=library,
-            **vars(interface),
-        )
+        num_envs = min(batch_envs, envs_per_robot - first) * len(specs)
+        batch = _batch(specs, first * len(specs), num_envs, config, interface, library)
         try:
             controller = controller or make()
             with part_of(total, first * rounds * len(specs)):
@@ -249,6 +240,69 @@ def _run_all(
         finally:
             batch.close()
     return episodes
+
+
+def _batch(
+    specs: Sequence[EnvSpec],
+    first: int,
+    num_envs: int,
+    config: EvalConfig,
+    interface: Interface,
+    library: tuple[Path, ...],
+) -> TaskBatch:
+    """Make environments of an evaluation, from the one with the number ``first`` on."""
+    return batch_from_specs(
+        specs,
+        num_envs,
+        first=first,
+        sim=config.sim,
+        seed=int(np.random.SeedSequence([EVAL_SEED_OFFSET, config.seed]).generate_state(1)[0]),
+        workers=config.workers,
+        layouts="eval",
+        device=SIMULATORS[config.sim].devices[0],
+        library=library,
+        **vars(interface),
+    )
+
+
+def episodes_again(
+    controller: Baseline | tuple[dict[str, Any], Mode],
+    source: Source,
+    config: EvalConfig,
+    interface: Interface,
+    chosen: Sequence[tuple[str, int]],
+) -> list[Episode]:
+    """Run episodes of an evaluation again, given by the robot's name and their number.
+
+    ``controller`` is a baseline, or the learner of a checkpoint with its mode. Where actions depend
+    on no other environment each episode has a batch of its own; else all episodes are run.
+    """
+    library, tasks, is_alone = tuple(map(Path, source.library)), None, False
+    make: MakeController
+    if isinstance(controller, Baseline):
+        make = partial(controller.make, config.seed)
+        tasks, is_alone = controller.tasks, controller.is_independent
+    else:
+        learner, mode = controller
+        is_alone = mode == "deterministic"
+
+        def make() -> Controller:
+            return PolicyController(Policy(learner, mode, config.seed))
+
+    specs = _specs(source, config, tasks)
+    robots = {spec.robot.name: i for i, spec in enumerate(specs)}
+    rounds, _ = _rounds(config)
+    if not is_alone:
+        episodes = _run_all(make, specs, config, interface, library)
+        return [episodes[robots[robot]][number] for robot, number in chosen]
+    found = []
+    for i, (robot, number) in enumerate(chosen):
+        env, earlier = divmod(number, rounds)
+        env_number = env * len(specs) + robots[robot]
+        batch = _batch(specs, env_number, 1, config, interface, library)
+        with closing(batch), part_of(len(chosen), i):
+            found.append(run_episodes(batch, make(), earlier + 1)[-1])
+    return found
 
 
 def _score(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -79,6 +80,35 @@ def stratified_mean_interval(strata: Sequence[ArrayLike]) -> Interval:
     return _interval(mean, tables, statistic, paired=False)
 
 
+def mean_interval(seeds: Sequence[Sequence[ArrayLike]], *, together: bool = True) -> Interval:
+    """Return the mean over training seeds of the means of their strata, with a bootstrap.
+
+    It resamples the seeds, and the samples of every stratum in each of them: a method is the sample
+    of its trainings, which differ more than the episodes of one. A single seed tells nothing of
+    them; its interval is ``stratified_mean_interval``, of the episodes alone.
+
+    ``together``: A resample has whole seeds; else it has a seed of each stratum, for policies of
+    single robots.
+    """
+    if len(seeds) == 1:
+        return stratified_mean_interval(seeds[0])
+    tables = [[np.asarray(samples, dtype=np.float64) for samples in strata] for strata in seeds]
+    mean = float(np.mean([[samples.mean() for samples in strata] for strata in tables]))
+    generator = np.random.default_rng(0)
+    num_strata = len(tables[0])
+    means = np.zeros((RESAMPLES, num_strata))
+    for _ in tables:  # a resample has as many seeds as there are
+        shape = (RESAMPLES, 1 if together else num_strata)
+        drawn = np.broadcast_to(generator.integers(len(tables), size=shape), means.shape)
+        for (seed, strata), stratum in itertools.product(enumerate(tables), range(num_strata)):
+            rows, samples = np.flatnonzero(drawn[:, stratum] == seed), strata[stratum]
+            picked = generator.integers(len(samples), size=(len(rows), len(samples)))
+            means[rows, stratum] += samples[picked].mean(axis=1) / len(tables)
+    tail = (1 - LEVEL) / 2
+    low, high = np.quantile(means.mean(axis=1), (tail, 1 - tail)).tolist()
+    return Interval(mean, low, high) if low < high else Interval(mean, math.nan, math.nan)
+
+
 def success_interval(rates: ArrayLike, trials: ArrayLike) -> Interval:
     """Return a mean success rate with its interval (Wilson 1927), which stays within 0 and 1.
 
@@ -96,18 +126,79 @@ def success_interval(rates: ArrayLike, trials: ArrayLike) -> Interval:
     return Interval(mean, float(result.low), float(result.high))
 
 
-def episode_interval(
-    scores: Sequence[ArrayLike], successes: Sequence[ArrayLike], *, relative: bool
+def seeds_success_interval(
+    seeds: Sequence[Sequence[Sequence[bool]]], *, together: bool = True
 ) -> Interval:
-    """Return the mean over robots of their mean scores.
+    """Return the mean success rate of seeds and robots, from the successes of their episodes.
 
-    Its interval is ``success_interval`` if the score of an episode is its success, as that of push;
-    else ``stratified_mean_interval``. Scores and successes of a robot have the shape (episodes,).
+    Its interval has that of all episodes (``success_interval``), which a single seed has, and that
+    of the seeds (``mean_interval``): seeds that agree are no less uncertain than their episodes.
     """
-    if not relative and all(map(np.array_equal, scores, successes)):
-        tables = [np.asarray(each, dtype=np.float64) for each in successes]
-        return success_interval([each.mean() for each in tables], [each.size for each in tables])
-    return stratified_mean_interval(scores)
+    successes = [each for strata in seeds for each in strata]
+    interval = success_interval([np.mean(each) for each in successes], list(map(len, successes)))
+    if len(seeds) == 1:
+        return interval
+    of_seeds = mean_interval(seeds, together=together)
+    low, high = (interval.low, of_seeds.low), (interval.high, of_seeds.high)
+    return Interval(interval.value, float(np.nanmin(low)), float(np.nanmax(high)))
+
+
+def episode_interval(
+    scores: Sequence[Sequence[ArrayLike]],
+    successes: Sequence[Sequence[Sequence[bool]]],
+    *,
+    relative: bool,
+) -> Interval:
+    """Return the mean over seeds and robots of their mean scores.
+
+    Its interval is ``seeds_success_interval`` if the score of an episode is its success, as that of
+    push; else ``mean_interval``. Scores and successes are lists of seeds, of robots, of episodes.
+    """
+    pairs = zip(itertools.chain(*scores), itertools.chain(*successes), strict=True)
+    if not relative and all(np.array_equal(*pair) for pair in pairs):
+        return seeds_success_interval(successes)
+    return mean_interval(scores)
+
+
+POWER = 0.8  # probability that a difference shows, by convention
+_Z_LEVEL, _Z_POWER = 1.959964, 0.841621
+"""Quantiles of the normal distribution, of ``LEVEL`` on two sides and of ``POWER``."""
+
+
+def smallest_rate_difference(episodes: int) -> float:
+    """Return the smallest difference of two success rates, around 50%, that shows.
+
+    It does at ``LEVEL`` with the probability ``POWER``, where either method has so many episodes
+    (Fleiss, Levin and Paik 2003, Statistical Methods for Rates and Proportions, chapter 4, without
+    correction for continuity): d = (z1 sqrt(2 p q) + z2 sqrt(p1 q1 + p2 q2)) / sqrt(n) with
+    p1, p2 = (1 +- d) / 2. Around other rates it is smaller.
+    """
+    # With d = sin(x) it is: sqrt(2 n) sin(x) - z2 cos(x) = z1.
+    norm = math.hypot(math.sqrt(2 * episodes), _Z_POWER)
+    angle = math.asin(min(_Z_LEVEL / norm, 1)) + math.asin(_Z_POWER / norm)
+    return math.sin(min(angle, math.pi / 2))
+
+
+def smallest_mean_difference(errors: tuple[float, float]) -> float:
+    """Return the smallest difference of two means with standard errors that shows, likewise."""
+    return (_Z_LEVEL + _Z_POWER) * math.hypot(*errors)
+
+
+def mean_error(seeds: Sequence[Sequence[ArrayLike]]) -> float:
+    """Return the standard error of ``mean_interval``: of the seeds, or more of their episodes.
+
+    It is nan if there is one seed with one episode of a robot.
+    """
+    errors = [
+        np.std(samples, ddof=1) / math.sqrt(np.size(samples)) if np.size(samples) > 1 else math.nan
+        for strata in seeds
+        for samples in strata
+    ]
+    of_episodes = float(np.linalg.norm(errors)) / len(errors)
+    if len(seeds) == 1:
+        return of_episodes
+    means = [np.mean([np.mean(samples) for samples in strata]) for strata in seeds]
+    return float(np.fmax(of_episodes, np.std(means, ddof=1) / math.sqrt(len(seeds))))
 
 
 def iqm_interval(scores: ArrayLike, *, together: bool) -> Interval:
@@ -238,7 +329,7 @@ def score_of(outcomes: RobotOutcomes, angles: Sequence[float], reach: float) -> 
     """Return the score of a robot of a reach [m] from its episodes and their last angles."""
     task, distance = TASKS[outcomes.task], float(np.mean(outcomes.distance))
     interval = episode_interval(
-        [relative_scores(outcomes)], [outcomes.success], relative=task.relative_to_random
+        [[relative_scores(outcomes)]], [[outcomes.success]], relative=task.relative_to_random
     )
     success = success_interval(np.mean(outcomes.success), len(outcomes.success))
     return Score(

@@ -39,6 +39,8 @@ from morphgen.benchmark.scores.results import (
     NOTE,
     References,
     collect_references,
+    floor,
+    method_rows,
     ranked,
     ranking_data,
     ranking_table,
@@ -47,12 +49,13 @@ from morphgen.benchmark.scores.results import (
     result_rows,
     result_tables,
     rows_data,
-    score_submission,
+    smallest_differences,
     study_results,
 )
 from morphgen.benchmark.scores.submission import (
     DEFAULT_EPISODES,
     EvalProtocol,
+    Submission,
     check_submission,
     expected_robots,
     protocol_from,
@@ -88,6 +91,7 @@ from morphgen.formats.files import require_writable_file, require_writable_folde
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding
 from morphgen.rl.baselines import BASELINES
+from morphgen.rl.scores import POWER
 from morphgen.splits.split import HOLD_OUT, REGIMES, SIDES, Split, split_id
 from morphgen.splits.split_file import read_split, split_names, split_paths, write_new_splits
 from morphgen.tables import table
@@ -492,8 +496,8 @@ def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -
     return notes
 
 
-def score(args: argparse.Namespace) -> None:
-    """Score submissions and print the ranking."""
+def score(args: argparse.Namespace) -> int:
+    """Score submissions, run episodes again if asked to, and print the ranking."""
     submissions = [read_submission(path) for path in args.submissions]
     library = opt.library_of(args)
     name = args.split or _shipped_split(submissions[0].split.name, args.submissions[0])
@@ -519,17 +523,23 @@ def score(args: argparse.Namespace) -> None:
             "a release that has one (split release --scores)"
         )
     with status(args, "scoring"):
-        rows = [score_submission(each, random) for each in submissions] + references.rows()
-    data = {
+        rows = method_rows(submissions, random) + references.rows()
+    smallest, lowest = smallest_differences(rows), floor([each for _, each in named])
+    data: dict[str, Any] = {
         "split": split.name,
         "random": "release" if random else "submission",
         "warnings": warnings,
         "rows": ranking_data(ranked(rows)),
+        "smallest_differences": smallest,
+        "floor": lowest,
     }
-    notes = [
-        "MT: train robots, ZS: test robots; 95%: bootstrap over the episodes of each robot; "
-        "successes: Wilson"
-    ]
+    replays = _replays(args, submissions, split) if args.replay else []
+    if args.replay:
+        data["replays"] = [{"episode": line, "agrees": agrees} for line, agrees in replays]
+    notes = [NOTE, *map(_smallest_text, smallest)]
+    for task, rates in lowest.items():
+        names = ", ".join(f"{name} {rate:.0%}" for name, rate in rates.items())
+        notes.append(f"floor of success of {task} (ZS): {names}")
     if relative:
         whose = "the release" if random else "each submission"
         notes.append(
@@ -537,8 +547,50 @@ def score(args: argparse.Namespace) -> None:
             f"episodes of {whose}"
         )
     notes += [f"warning: {text}" for text in warnings]
+    notes += [line for line, _ in replays]
     style = "github" if args.markdown else "simple"
     opt.print_result(args, data, lambda: "\n".join([ranking_table(rows, style), "", *notes]))
+    return int(not all(agrees for _, agrees in replays))
+
+
+def _replays(
+    args: argparse.Namespace, submissions: Sequence[Submission], split: Split
+) -> list[tuple[str, bool]]:
+    """Run episodes of submissions again; return a line for each, and whether it agrees."""
+    # Other commands of splits need no torch.
+    from morphgen.benchmark.scores.replay import needs_checkpoint, replay_submission
+
+    named = list(zip(args.submissions, submissions, strict=True))
+    unnamed = [path for path, each in named if needs_checkpoint(each)]
+    if len(unnamed) != (args.checkpoint is not None):
+        files = ", ".join(map(str, unnamed)) or "none"
+        raise BenchmarkError(
+            f"--replay: submissions of policies that do not come with morphgen: {files}; expected "
+            "one with --checkpoint RUN, or none without it"
+        )
+    found = []
+    for path, each in named:
+        checkpoint = args.checkpoint if path in unnamed else None
+        with bar(args, f"running episodes of {path} again", "episode"):
+            for episode in replay_submission(
+                each,
+                str(path),
+                split,
+                count=args.replay,
+                seed=args.seed,
+                checkpoint=checkpoint,
+                library=tuple(args.library),
+            ):
+                found.append((f"{path}: {episode}", episode.agrees))
+    return found
+
+
+def _smallest_text(values: Mapping[str, Any]) -> str:
+    score = f", {values['score']:.3g} of scores" if values["score"] is not None else ""
+    return (
+        f"smallest difference of {values['task']} (ZS) that shows with {POWER:.0%} power: "
+        f"{values['success']:.1%} of success around 50% in {values['episodes']} episodes{score}"
+    )
 
 
 def _shipped_split(name: str, where: Path) -> str:

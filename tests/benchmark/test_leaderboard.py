@@ -25,6 +25,8 @@ from morphgen.benchmark.scores.results import (
     Row,
     SideScore,
     collect_references,
+    floor,
+    method_rows,
     random_scores,
     ranked,
     ranking_data,
@@ -32,6 +34,7 @@ from morphgen.benchmark.scores.results import (
     read_references,
     reference_files,
     score_submission,
+    smallest_differences,
     study_results,
 )
 from morphgen.benchmark.scores.submission import (
@@ -43,7 +46,12 @@ from morphgen.benchmark.scores.submission import (
 from morphgen.benchmark.survey import BaselineResult
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import default_library
-from morphgen.rl.scores import Interval, stratified_mean_interval, success_interval
+from morphgen.rl.scores import (
+    Interval,
+    smallest_rate_difference,
+    stratified_mean_interval,
+    success_interval,
+)
 
 LIBRARY = default_library()
 
@@ -67,6 +75,29 @@ def test_scores_are_computed_from_the_episodes():
     train = row.sides["train", "reach"]
     assert train.score.value == relative.mean()
     assert test.score.high - test.score.low > train.score.high - train.score.low > 0
+
+
+def test_seeds_of_a_method_are_one_row_and_another_run_of_a_seed_is_its_own():
+    second = data(successes=1) | {"training_seed": 1}
+    runs = [submission(second), submission()]
+    (one,) = method_rows(runs)
+    assert (one.seeds, one.sides["test", "reach"].episodes) == ((0, 1), 8)
+    assert one.sides["test", "reach"].success.value == 0.5
+    rows = method_rows([*runs, submission(data(near=9.0)), submission(data("other"))])
+    assert [each.seeds for each in rows] == [(1,), (0,), (0,), (0,)]
+    assert "0, 1" in ranking_table([one])
+
+
+def test_the_floor_and_the_smallest_difference_are_computed():
+    (values,) = smallest_differences(method_rows([submission(), submission(data("other"))]))
+    assert (values["task"], values["episodes"]) == ("reach", 4)
+    assert values["success"] == smallest_rate_difference(4)
+    assert values["score"] == pytest.approx(
+        2.8016 * math.sqrt(2) * np.std([150, 151, 152, -1]) / math.sqrt(3), rel=1e-3
+    )
+    assert floor([submission()]) == {"reach": {"random": 0.0}}
+    zero = submission(data("zero", successes=1) | BASELINE)
+    assert floor([submission(), zero]) == {"reach": {"zero": 0.25, "random": 0.0}}
 
 
 def test_the_random_scores_of_a_release_replace_those_of_a_submission():

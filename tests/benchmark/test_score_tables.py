@@ -21,6 +21,7 @@ from morphgen.benchmark.scores.submission import (
     submission_from,
 )
 from morphgen.errors import BenchmarkError
+from morphgen.rl.scores import mean_interval
 from morphgen.splits.split import split_id
 from morphgen.splits.split_file import read_split
 
@@ -62,9 +63,12 @@ def test_a_row_has_all_seeds_of_a_method_and_the_difference_to_the_reference():
         assert robots.episodes == trials, side
         assert robots.mean == pytest.approx(np.mean(scores))
         assert robots.iqm.low <= robots.iqm.value <= robots.iqm.high
-        assert (robots.success.low, robots.success.high) == pytest.approx(
-            wilson(7 * robots.robots, trials), abs=1e-6
-        )
+        low, high = wilson(7 * robots.robots, trials)
+        successes = [[[True] * 4] * robots.robots, [[True] * 3 + [False]] * robots.robots]
+        of_seeds = mean_interval(successes)
+        ends = min(low, of_seeds.low), max(high, of_seeds.high)
+        assert (robots.success.low, robots.success.high) == pytest.approx(ends, abs=1e-6)
+        assert of_seeds.low <= 0.75 < 1 <= of_seeds.high  # from the worse seed to the better one
         assert robots.difference.value == pytest.approx(
             np.mean(scores, axis=0).mean() - reference.mean()
         )

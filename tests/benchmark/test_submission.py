@@ -10,8 +10,10 @@ from helpers.submissions import EXPECTED, PROTOCOL, SPLIT, TEST, VERSION, change
 from morphgen.benchmark.scores.submission import (
     EvalProtocol,
     check_submission,
+    content_digest,
     protocol_from,
     read_submission,
+    read_submissions,
     submission_text,
 )
 from morphgen.errors import BenchmarkError, MorphgenError
@@ -35,7 +37,26 @@ def test_a_submission_is_read_as_it_was_written(tmp_path):
     path = tmp_path / "s.json"
     path.write_text(submission_text(submission()))
     assert read_submission(path) == submission()
-    assert json.loads(path.read_text()) == data()
+    values = json.loads(path.read_text())
+    assert values.pop("sha256") == content_digest(data())
+    assert values == data()
+
+
+def test_an_edited_file_is_refused_and_one_without_its_hash_noted(tmp_path, caplog):
+    path = tmp_path / "s.json"
+    values = json.loads(submission_text(submission()))
+    path.write_text(json.dumps(values))  # in another layout
+    assert read_submission(path) == submission()
+    values["robots"][TEST]["score"][0] += 1
+    path.write_text(json.dumps(values))
+    for read in (read_submission, lambda path: read_submissions([path])):
+        with pytest.raises(BenchmarkError, match=r"s\.json: sha256: .*: it was edited after"):
+            read(path)
+    assert not caplog.text
+    del values["sha256"]
+    path.write_text(json.dumps(values))
+    read_submission(path)
+    assert "an earlier version wrote no sha256" in caplog.text
 
 
 FAULTS = {

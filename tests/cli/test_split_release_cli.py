@@ -1,6 +1,7 @@
 """``morphgen split release`` and ``score``, and ``eval --submission``."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from importlib.metadata import version
@@ -182,6 +183,29 @@ def test_submissions_are_recorded_scored_and_ranked(run, ok, refused, small):
     Path("broken.json").write_text(json.dumps(broken))
     err = refused("split", "score", "ik.json", "broken.json", "--split", archive)
     assert err.startswith("morphgen: broken.json: test robot planar-plane: score[0]: 999; expected")
+
+
+def test_episodes_of_a_submission_are_run_again(run, refused, small):
+    few = ("--episodes", "2")
+    run(*RELEASE, small, *few, "--no-goals")
+    archive = "releases/mine-small-1.0.0.zip"
+    shutil.unpack_archive(archive, ".")
+    assert (
+        run("eval", "zero", "--split", "mine-small-1.0.0", *few, "--submission", "a.json")[0] == 0
+    )
+    score = ("split", "score", "a.json", "--split", archive, "--replay", "2")
+    code, out, _ = run(*score)
+    assert (code, out.count(": agrees\n")) == (0, 2)
+    values = json.loads(Path("a.json").read_text())
+    del values["sha256"]
+    for robot in values["robots"]:
+        robot["distance"] = [each + 0.01 for each in robot["distance"]]
+    Path("a.json").write_text(json.dumps(values))
+    code, out, _ = run(*score, "--seed", "3")
+    assert code == 1
+    assert len(re.findall(r"a\.json: \w+ robot \S+, episode [01]: .*: DIFFERS: again ", out)) == 2
+    Path("a.json").write_text(json.dumps(values | {"method": "mine"}))
+    assert "a.json; expected one with --checkpoint RUN" in refused(*score)
 
 
 @pytest.mark.slow

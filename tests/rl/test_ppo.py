@@ -38,6 +38,11 @@ from morphgen.rl.scores import (
     Interval,
     episode_interval,
     iqm_interval,
+    mean_error,
+    mean_interval,
+    seeds_success_interval,
+    smallest_mean_difference,
+    smallest_rate_difference,
     stratified_mean_interval,
     success_interval,
 )
@@ -584,15 +589,42 @@ def test_robots_of_equally_many_episodes_are_as_one():
     assert few.high - few.low > even.high - even.low  # the mean is no surer than its worst half
 
 
+def test_seeds_are_the_unit_of_an_interval():
+    rng = np.random.default_rng(0)
+    seeds = [[rng.normal(mean, 1, 34), rng.normal(mean, 1, 20)] for mean in (0, 0, 10, 10)]
+    found, alone = mean_interval(seeds), mean_interval(seeds[:1])
+    assert alone == stratified_mean_interval(seeds[0])
+    assert found.value == pytest.approx(np.mean([[np.mean(each) for each in s] for s in seeds]))
+    assert found.low < 0.5 < 9.5 < found.high  # of all seeds alike: one in 16 resamples each
+    apart = mean_interval(seeds, together=False)  # two strata are independent samples of seeds
+    assert found.high - found.low > apart.high - apart.low > 1
+    assert mean_error(seeds) == pytest.approx(10 / math.sqrt(12), rel=0.1)
+    assert mean_error([[[0.0, 2.0], [1.0, 3.0]]]) == pytest.approx(1 / math.sqrt(2))
+    certain = [[[True] * 20] * 2] * 3
+    assert seeds_success_interval(certain) == success_interval(1, 120)
+    differing = seeds_success_interval([[[True] * 20], [[False] * 20]])
+    assert (differing.low, differing.high) == (0, 1)
+
+
+@pytest.mark.parametrize("episodes", [34, 340])
+def test_the_smallest_difference_of_rates_follows_from_the_number_of_episodes(episodes):
+    difference = smallest_rate_difference(episodes)
+    low, high = (1 - difference) / 2, (1 + difference) / 2
+    spread = 1.959964 * math.sqrt(0.5) + 0.841621 * math.sqrt(low * (1 - low) + high * (1 - high))
+    assert episodes == pytest.approx((spread / difference) ** 2)  # Fleiss' formula for n
+    assert smallest_rate_difference(1) == 1
+    assert smallest_mean_difference((3.0, 4.0)) == pytest.approx(2.8016 * 5, abs=1e-3)
+
+
 @pytest.mark.parametrize("value", [0, 1])
 def test_scores_that_are_successes_have_the_interval_of_successes(value):
     scores, successes = [[float(value)] * 12] * 3, [[bool(value)] * 12] * 3
-    found = episode_interval(scores, successes, relative=False)
+    found = episode_interval([scores], [successes], relative=False)
     assert found == success_interval(value, 36)
-    relative = episode_interval(scores, successes, relative=True)
+    relative = episode_interval([scores], [successes], relative=True)
     assert (relative.value, math.isnan(relative.low)) == (value, True)
     mixed = [[0.0, 1.0], [1.0, 1.0]]
-    assert episode_interval(mixed, mixed, relative=False) == success_interval(0.75, 4)
+    assert episode_interval([mixed], [mixed], relative=False) == success_interval(0.75, 4)
 
 
 @pytest.mark.parametrize(
@@ -601,7 +633,7 @@ def test_scores_that_are_successes_have_the_interval_of_successes(value):
 def test_scores_without_a_spread_have_no_interval(scores):
     for found in (
         stratified_mean_interval(scores),
-        episode_interval(scores, [[False] * len(each) for each in scores], relative=True),
+        episode_interval([scores], [[[False] * len(each) for each in scores]], relative=True),
         iqm_interval(np.transpose(scores), together=True),
         iqm_interval(np.array([[1.0] * 15 + [0.9], [1.0] * 15 + [0.8]]), together=True),
     ):

@@ -1,12 +1,13 @@
 """Results of submissions, computed from the episodes: rankings, reference scores, tables of seeds.
 
 Reference scores are those of submissions in a release, and of the baselines of a study. In tables,
-scores of several seeds of a method stand in one row: interquartile means with a bootstrap over the
-seeds, success rates with Wilson intervals, and paired differences to a reference controller.
+scores of several seeds of a method stand in one row, whose intervals resample the seeds:
+interquartile means, success rates, and paired differences to a reference controller.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import re
@@ -27,18 +28,19 @@ from morphgen.benchmark.scores.submission import (
     check_submission,
     expected_robots,
     name_of,
-    read_submission,
     read_submissions,
     read_table,
     require_comparable,
     require_same_random,
+    submission_from,
     submission_text,
 )
 from morphgen.benchmark.survey import BaselineResult, BaselineResults
 from morphgen.errors import BenchmarkError, nearest
+from morphgen.formats.data_files import read_json
 from morphgen.grammar.library import Library
 from morphgen.rl.agents import AGENTS
-from morphgen.rl.baselines import BASELINES
+from morphgen.rl.baselines import BASELINES, ZERO
 from morphgen.rl.scores import SIDES as SIDE_NAMES
 from morphgen.rl.scores import (
     Interval,
@@ -47,10 +49,13 @@ from morphgen.rl.scores import (
     episode_interval,
     finite_or_none,
     iqm_interval,
+    mean_error,
+    mean_interval,
     relative_scores,
     score_decimals,
-    stratified_mean_interval,
-    success_interval,
+    seeds_success_interval,
+    smallest_mean_difference,
+    smallest_rate_difference,
 )
 from morphgen.splits.split import SIDES, Side, Split, split_id
 from morphgen.splits.split_file import read_split, split_names
@@ -67,12 +72,15 @@ class SideScore:
 
     robots: int
     score: Interval  # mean score, relative to the random policy where the task wants it
-    success: Interval  # mean success rate, 0 to 1, with its Wilson interval over all episodes
+    success: Interval  # mean success rate, 0 to 1; see `seeds_success_interval`
+    episodes: int = 0  # number of episodes of all robots and seeds
+    error: float = math.nan  # standard error of the score; see `mean_error`
 
     def as_data(self) -> dict[str, Any]:
         """Return JSON values, with null for ends of intervals that are not known."""
         score, success = self.score, self.success
         values = {"robots": self.robots, "score": score.value, "success": success.value}
+        values |= {"episodes": self.episodes, "error": self.error}
         values |= {"low": score.low, "high": score.high}
         values |= {"success_low": success.low, "success_high": success.high}
         return dict(finite_or_none(values))
@@ -99,33 +107,96 @@ class Row:
         return f"{self.method} ({', '.join(remarks)})" if remarks else self.method
 
 
+def method_rows(
+    submissions: Sequence[Submission],
+    random: RandomScores | None = None,
+    source: Source = "submission",
+) -> list[Row]:
+    """Return a row for each method, from the submissions of all its training seeds.
+
+    Submissions of one seed are of different policies with one name: each is a row of its own.
+    """
+    groups: dict[Any, list[Submission]] = {}
+    for each in submissions:
+        robots = frozenset((robot.side, robot.robot) for robot in each.robots)
+        groups.setdefault((_key(each), each.training_seed is None, robots), []).append(each)
+    rows = []
+    for own in groups.values():
+        are_seeds = len({each.training_seed for each in own}) == len(own)
+        for runs in [own] if are_seeds else [[each] for each in own]:
+            rows.append(score_runs(runs, random, source))
+    return rows
+
+
 def score_submission(
     submission: Submission, random: RandomScores | None = None, source: Source = "submission"
 ) -> Row:
     """Compute the scores of a submission that was checked."""
-    groups: dict[tuple[Side, str], list[RobotOutcomes]] = {}
-    for outcomes in sorted(submission.robots, key=lambda robot: SIDES.index(robot.side)):
-        groups.setdefault((outcomes.side, outcomes.task), []).append(outcomes)
+    return score_runs([submission], random, source)
+
+
+def score_runs(runs: Sequence[Submission], random: RandomScores | None, source: Source) -> Row:
+    """Compute the scores of the runs of a method, one for each training seed."""
+    first, *_ = runs
     sides = {}
-    for (side, task), robots in groups.items():
-        successes = [each.success for each in robots]
-        score = episode_interval(
-            [relative_scores(each, random) for each in robots],
-            successes,
-            relative=TASKS[task].relative_to_random,
+    for side, task in ((side, task) for side in SIDES for task in TASKS):
+        tables = [_outcomes(run, side, task) for run in runs]
+        robots = list(tables[0])
+        if not robots:
+            continue
+        scores = [[relative_scores(table[name], random) for name in robots] for table in tables]
+        successes = [[table[name].success for name in robots] for table in tables]
+        sides[side, task] = SideScore(
+            len(robots),
+            episode_interval(scores, successes, relative=TASKS[task].relative_to_random),
+            seeds_success_interval(successes),
+            sum(map(len, itertools.chain(*successes))),
+            mean_error(scores),
         )
-        success = success_interval(list(map(np.mean, successes)), list(map(len, successes)))
-        sides[side, task] = SideScore(len(robots), score, success)
-    seed = submission.training_seed
     return Row(
-        submission.method,
+        first.method,
         source,
-        submission.mode,
-        () if seed is None else (seed,),
-        min(len(each.score) for each in submission.robots),
+        first.mode,
+        tuple(sorted(run.training_seed for run in runs if run.training_seed is not None)),
+        min(len(each.score) for run in runs for each in run.robots),
         sides,
-        submission.finetuned,
+        first.finetuned,
     )
+
+
+def smallest_differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Return the smallest differences that the test episodes of any two rows show, by task.
+
+    ``success`` is that of two rates around 50%, from the row with the fewest episodes; ``score``
+    that of the rows with the largest standard errors, None if one is not known.
+    """
+    tasks = {task for row in rows for side, task in row.sides if side == "test"}
+    found = []
+    for task in sorted(tasks):
+        own = [row.sides["test", task] for row in rows if ("test", task) in row.sides]
+        episodes = min(side.episodes for side in own)
+        errors = np.sort([side.error for side in own])  # nan last
+        largest = float(errors[-1]), float(errors[-min(2, len(errors))])
+        values = {"task": task, "episodes": episodes, "success": smallest_rate_difference(episodes)}
+        found.append(finite_or_none(values | {"score": smallest_mean_difference(largest)}))
+    return found
+
+
+def floor(submissions: Sequence[Submission]) -> dict[str, dict[str, float]]:
+    """Return the success rate on the test robots of ``zero`` and ``random``, by task and name.
+
+    That of ``random`` is in every submission; that of ``zero`` needs a submission of it.
+    """
+    rates: dict[str, dict[str, float]] = {}
+    for name in (ZERO.name, RANDOM):
+        own = next((each for each in submissions if _is_baseline(each, name)), None)
+        known = own or (submissions[0] if name == RANDOM else None)
+        for task in TASKS if known else ():
+            robots = _outcomes(known, "test", task).values() if known else ()
+            lists = [each.success if own else each.random_success for each in robots]
+            if lists and all(lists):
+                rates.setdefault(task, {})[name] = float(np.mean(list(map(np.mean, lists))))
+    return rates
 
 
 def random_scores(submission: Submission) -> RandomScores:
@@ -214,7 +285,7 @@ class References:
 
     def rows(self) -> list[Row]:
         """Return the scores of the submissions."""
-        return [score_submission(each, self.random, "reference") for each in self.submissions]
+        return method_rows(self.submissions, self.random, "reference")
 
     def results(self) -> BaselineResults:
         """Return the results of the baselines, in the order of ``BASELINES``."""
@@ -266,7 +337,7 @@ def reference_files(references: References) -> dict[str, bytes]:
 def read_references(folder: Path) -> References:
     """Read the reference scores of a release; they were checked when it was made."""
     files = sorted((folder / SUBMISSIONS_DIR).glob("*.json"))
-    return References(tuple(read_submission(file) for file in files))
+    return References(tuple(submission_from(read_json(file), file) for file in files))
 
 
 def _is_baseline(submission: Submission, *names: str) -> bool:
@@ -327,7 +398,10 @@ def study_results(folder: Path, split: Split) -> BaselineResults:
     return _baseline_results(list(own.values()), None)
 
 
-NOTE = "MT: train robots, ZS: test robots; intervals: 95%"
+NOTE = (
+    "MT: train robots, ZS: test robots; intervals: 95%, over seeds and the episodes of each; over "
+    "the episodes of a single seed"
+)
 
 
 REFERENCES: Mapping[str, str] = {
@@ -345,10 +419,10 @@ class SideResult:
     episodes: int  # number of episodes of all robots and seeds
     mean: float  # mean score over seeds and robots
     iqm: Interval  # interquartile mean of the scores of seeds and robots; no interval for one seed
-    success: Interval  # success rate of all episodes with its Wilson interval
+    success: Interval  # mean success rate; see `seeds_success_interval`
     difference: Interval | None
-    """Score minus that of the reference in the same episodes, with a bootstrap over the episodes
-    of each robot; None without a reference."""
+    """Score minus that of the reference in the same episodes, see `mean_interval`; None without a
+    reference."""
 
 
 @dataclass(frozen=True)
@@ -447,17 +521,21 @@ def _side_results(
         )
         # Policies of single robots are independent samples on the robots that they learned.
         together = not any(_learned_alone(run, side) for run in runs)
-        successes = [table[name].success for table in tables for name in robots]
-        episodes = [len(each) for each in successes]
+        successes = [[table[name].success for name in robots] for table in tables]
         yield (
             side,
             SideResult(
                 len(robots),
-                sum(episodes),
+                sum(map(len, itertools.chain(*successes))),
                 float(scores.mean()),
                 iqm_interval(scores, together=together),
-                success_interval([np.mean(each) for each in successes], episodes),
-                _difference(tables, robots, _outcomes(reference, side, task) if reference else {}),
+                seeds_success_interval(successes, together=together),
+                _difference(
+                    tables,
+                    robots,
+                    _outcomes(reference, side, task) if reference else {},
+                    together=together,
+                ),
             ),
         )
 
@@ -478,25 +556,25 @@ def _difference(
     tables: Sequence[Mapping[str, RobotOutcomes]],
     robots: Sequence[str],
     reference: Mapping[str, RobotOutcomes],
+    *,
+    together: bool,
 ) -> Interval | None:
     """Return the mean difference to the reference; None if it lacks a robot or is the method."""
     if not reference.keys() >= set(robots) or tables[0] == reference:
         return None
-    strata: list[Array] = []
+    differences: list[list[Array]] = [[] for _ in tables]
     for name in robots:
         own = relative_scores(reference[name])
-        for each in tables:
-            if len(each[name].score) % len(own):
+        for run, found in zip(tables, differences, strict=True):
+            scores = relative_scores(run[name])
+            if len(scores) % len(own):
                 raise BenchmarkError(
-                    f"robot {name}: {len(each[name].score)} episodes; expected a multiple of the "
-                    f"{len(own)} of the reference"
+                    f"robot {name}: {len(scores)} episodes; expected a multiple of the {len(own)} "
+                    "of the reference"
                 )
-        # Policies of single robots have the episodes of each policy one after another.
-        seeds = [
-            relative_scores(table[name]).reshape(-1, len(own)).mean(axis=0) for table in tables
-        ]
-        strata.append(np.mean(seeds, axis=0) - own)
-    return stratified_mean_interval(strata)
+            # Policies of single robots have the episodes of each policy one after another.
+            found.append(scores.reshape(-1, len(own)).mean(axis=0) - own)
+    return mean_interval(differences, together=together)
 
 
 def rows_data(rows: Sequence[ResultRow]) -> list[Any]:

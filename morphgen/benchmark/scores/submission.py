@@ -4,7 +4,7 @@ It follows the rules of a release, so that scores can be compared; see ``EvalPro
 
 Scores are not part of it: ``morphgen.benchmark.scores.results`` computes them from the episodes.
 Lists of a robot have an entry per episode, in the order of the evaluation, which the seed
-determines.
+determines. A file ends with the SHA-256 of its content, which an edited one does not have.
 
 ``episodes.csv.gz``, the table of a study, has a row per episode. Before the rows of each run and
 mode stands a line that begins with ``#``: the submission without its robots, as JSON. Tools that
@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import csv
 import gzip
+import hashlib
 import io
 import itertools
 import json
@@ -42,6 +43,7 @@ from morphgen.formats.records import Record, dotted_values, read_record
 from morphgen.grammar.library import Library
 from morphgen.model.kinematics import reach
 from morphgen.processes import parallel_map
+from morphgen.progress import note
 from morphgen.rl.scores import LISTS, Count, Name, RobotOutcomes, Score
 from morphgen.splits.split import Member, Side, Split, sided_members, split_id
 from morphgen.tasks.goals.goal_sets import goal_set_key
@@ -132,6 +134,15 @@ def make_submission(
     return read_record(data, Submission, "submission", BenchmarkError)
 
 
+DIGEST = "sha256"
+
+
+def content_digest(data: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of the data of a submission, without that of its file."""
+    content = {key: value for key, value in data.items() if key != DIGEST}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
 def submission_text(submission: Submission) -> str:
     """Return the text of a submission: a line per list of a robot."""
     data = msgspec.to_builtins(submission)
@@ -139,13 +150,14 @@ def submission_text(submission: Submission) -> str:
     for name in ("training", "config"):
         if data[name] is None:
             del data[name]
+    digest = content_digest(data | {"robots": robots})
     head = json.dumps(data, indent=2).removesuffix("\n}")
     blocks = [
         ",\n".join(f"      {json.dumps(key)}: {json.dumps(value)}" for key, value in robot.items())
         for robot in robots
     ]
     body = ",\n".join(f"    {{\n{block}\n    }}" for block in blocks)
-    return f'{head},\n  "robots": [\n{body}\n  ]\n}}\n'
+    return f'{head},\n  "robots": [\n{body}\n  ],\n  "{DIGEST}": "{digest}"\n}}\n'
 
 
 def is_submission(data: object) -> bool:
@@ -161,11 +173,23 @@ def read_submission(path: Path) -> Submission:
             f"{path}: no submission; expected an object with the kind {KIND!r}, as morphgen eval "
             "--submission writes it"
         )
+    if DIGEST not in data:
+        note(f"morphgen: {path}: an earlier version wrote no {DIGEST}: it may have been edited")
     return submission_from(data, path)
 
 
 def submission_from(data: object, where: Path | str) -> Submission:
-    """Return the submission of a JSON file's content, and check its form."""
+    """Return the submission of a JSON file's content, and check its form and its SHA-256.
+
+    Files of morphgen 0.3 have none.
+    """
+    if isinstance(data, dict) and DIGEST in data:
+        data = dict(data)
+        if (stored := data.pop(DIGEST)) != (found := content_digest(data)):
+            raise BenchmarkError(
+                f"{where}: {DIGEST}: {stored}; its content has {found}: it was edited after "
+                "morphgen eval; evaluate again with --submission"
+            )
     return read_record(data, Submission, str(where), BenchmarkError)
 
 
