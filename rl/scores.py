@@ -189,15 +189,16 @@ def mean_error(seeds: Sequence[Sequence[ArrayLike]]) -> float:
 
     It is nan if there is one seed with one episode of a robot.
     """
+    tables = [[np.asarray(samples, dtype=np.float64) for samples in strata] for strata in seeds]
     errors = [
-        np.std(samples, ddof=1) / math.sqrt(np.size(samples)) if np.size(samples) > 1 else math.nan
-        for strata in seeds
+        float(np.std(samples, ddof=1)) / math.sqrt(samples.size) if samples.size > 1 else math.nan
+        for strata in tables
         for samples in strata
     ]
-    of_episodes = float(np.linalg.norm(errors)) / len(errors)
-    if len(seeds) == 1:
+    of_episodes = math.hypot(*errors) / len(errors)
+    if len(tables) == 1:
         return of_episodes
-    means = [np.mean([np.mean(samples) for samples in strata]) for strata in seeds]
+    means = [np.mean([samples.mean() for samples in strata]) for strata in tables]
     return float(np.fmax(of_episodes, np.std(means, ddof=1) / math.sqrt(len(seeds))))
 
 

@@ -80,7 +80,7 @@ def replay_submission(
         run, learner = read_checkpoint(files[0])
         interface, controller = run.interface, (learner, submission.mode or "deterministic")
     rules = protocol_from(submission.evaluation, where)
-    config = EvalConfig(rules.episodes, rules.simulator, rules.seed, 1, rules.goals.tasks)
+    config = EvalConfig(rules.episodes, rules.simulator, rules.seed, 1, tuple(rules.goals.tasks))
     pairs = [(robot, i) for robot in submission.robots for i in range(len(robot.score))]
     rng = np.random.default_rng(seed)
     picked = sorted(rng.choice(len(pairs), min(count, len(pairs)), replace=False).tolist())
