@@ -271,11 +271,14 @@ def episodes_again(
     config: EvalConfig,
     interface: Interface,
     chosen: Sequence[tuple[str, int]],
+    *,
+    whole: bool = False,
 ) -> list[Episode]:
     """Run episodes of an evaluation again, given by the robot's name and their number.
 
     ``controller`` is a baseline, or the learner of a checkpoint with its mode. Where actions depend
-    on no other environment each episode has a batch of its own; else all episodes are run.
+    on no other environment each episode has a batch of its own, unless the ``whole`` evaluation
+    is asked for; else all episodes are run.
     """
     library, tasks, is_alone = tuple(map(Path, source.library)), None, False
     make: MakeController
@@ -292,7 +295,7 @@ def episodes_again(
     specs = _specs(source, config, tasks)
     robots = {spec.robot.name: i for i, spec in enumerate(specs)}
     rounds, _ = _rounds(config)
-    if not is_alone:
+    if whole or not is_alone:
         episodes = _run_all(make, specs, config, interface, library)
         return [episodes[robots[robot]][number] for robot, number in chosen]
     found = []
