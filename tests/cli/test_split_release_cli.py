@@ -182,6 +182,10 @@ def test_submissions_are_recorded_scored_and_ranked(run, ok, refused, small):
     broken["robots"][-1]["score"][0] = 999
     Path("broken.json").write_text(json.dumps(broken))
     err = refused("split", "score", "ik.json", "broken.json", "--split", archive)
+    assert err.startswith("morphgen: broken.json: sha256: ")
+    del broken["sha256"]
+    Path("broken.json").write_text(json.dumps(broken))
+    err = refused("split", "score", "ik.json", "broken.json", "--split", archive)
     assert err.startswith("morphgen: broken.json: test robot planar-plane: score[0]: 999; expected")
 
 
