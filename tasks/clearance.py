@@ -53,8 +53,9 @@ def _capsules(robot: Robot) -> list[tuple[int, Array, float]]:
         for shape in link.collisions:
             if isinstance(shape.geometry, Mesh):
                 raise TaskError(
-                    f"observation channel clearance: link {link.name!r} of robot {robot.name!r} "
-                    "has a mesh as its collision shape; expected primitives: see morphgen fit"
+                    f"observation channels contact and clearance: link {link.name!r} of robot "
+                    f"{robot.name!r} has a mesh as its collision shape; expected primitives: see "
+                    "morphgen fit"
                 )
             half = np.array(half_extents(shape.geometry))
             axis = int(half.argmax())

@@ -193,6 +193,11 @@ class _State:
         return forward_kinematics(self.tree, self.robot_index, self.q)
 
     @cached_property
+    def joint_axes(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Origins and axes of the joints at the links that they move, each (n, L, 3)."""
+        return joint_axes(self.tree, self.robot_index, self.T_root_link)
+
+    @cached_property
     def tool(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Pose of the tool, shape (n, 4, 4), and its Jacobian, shape (n, 6, J), at ``q``."""
         return frame_jacobian(self.chain, self.robot_index, self.q)
@@ -458,7 +463,7 @@ class KinematicChannels:
 
     def _point_columns(self, state: _State, points: torch.Tensor) -> torch.Tensor:
         """Return the velocities (n, J, 3) of points (n, J or 1, 3) by unit joint velocities."""
-        origins, axes = joint_axes(self._tree, self._index, state.T_root_link)
+        origins, axes = state.joint_axes
         at_joint = torch.arange(len(points), device=points.device)[:, None], self._link_of_joint
         axis, lever = axes[at_joint], points - origins[at_joint]
         prismatic = self._is_prismatic[..., None] > 0

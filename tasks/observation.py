@@ -347,6 +347,12 @@ def _layout_poses(specs: Sequence[EnvSpec], num_obstacles: int) -> torch.Tensor:
     return table
 
 
+def _object_boxes(scenes: Sequence[Scene]) -> torch.Tensor:
+    """Return edges and centres of ``Scene.object_box``, (n, 2, 3) [m]; zeros without an object."""
+    nothing = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    return torch.tensor([scene.object_box or nothing for scene in scenes])
+
+
 NOISE = 0.005  # standard deviation of a point's position along each axis, as of a depth camera [m]
 _NUMBERS = 8
 """Random numbers of a point: its face, its position in the box, and two pairs for noise."""
@@ -369,10 +375,9 @@ class PointClouds:
         self._local = torch.zeros(n, num_points, 3, device=device)
         self._on_block = torch.zeros(n, num_points, dtype=torch.bool, device=device)
         # Box 0 is the object, and the others are the obstacles; missing ones have no size.
-        sizes, centres = torch.zeros(n, 1 + num_obstacles, 3), torch.zeros(n, 3)
+        sizes = torch.zeros(n, 1 + num_obstacles, 3)
+        sizes[:, 0], centres = _object_boxes(scenes).unbind(1)
         for i, scene in enumerate(scenes):
-            if scene.object_box is not None:
-                sizes[i, 0], centres[i] = torch.tensor(scene.object_box)
             for k, box in enumerate(scene.obstacles, start=1):
                 sizes[i, k] = torch.tensor(box.size)
         self._sizes, self._centre = sizes.to(device), centres[:, None].to(device)
@@ -470,8 +475,6 @@ class BatchObservation:
         self._kinematics: KinematicChannels | None = None
         if names := config.kinematic_channels:
             has_object = torch.tensor([scene.object is not None for scene in scenes], device=device)
-            nothing = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-            boxes = torch.tensor([scene.object_box or nothing for scene in scenes], device=device)
             self._kinematics = KinematicChannels(
                 robot_tables,
                 index,
@@ -479,7 +482,7 @@ class BatchObservation:
                 has_object=has_object if config.objects or bool(has_object.any()) else None,
                 obstacles=layouts.poses,
                 obstacle_sizes=layouts.sizes,
-                object_boxes=boxes,
+                object_boxes=_object_boxes(scenes).to(device),
                 space_of=layouts.space,
             )
         self._points: PointClouds | None = None

@@ -298,9 +298,8 @@ def _draw_update(
     if shown.n == 0:  # a resumed run: the bar begins where the run was interrupted
         shown.initial = report.transitions - report.transitions // report.update
         shown.n = shown.initial
-    shown.set_postfix(
-        dict(reversed([*facts.items()])), refresh=False
-    )  # narrow terminals cut scores
+    # A narrow terminal cuts the end off; the scores come last in a line, so first in a bar.
+    shown.set_postfix(dict(reversed([*facts.items()])), refresh=False)
     shown.update(report.transitions - shown.n)
     if report.update == total:
         print_update(report, total, facts)

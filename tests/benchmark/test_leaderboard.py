@@ -33,7 +33,7 @@ from morphgen.benchmark.scores.results import (
     ranking_table,
     read_references,
     reference_files,
-    score_submission,
+    score_runs,
     smallest_differences,
     study_results,
 )
@@ -54,6 +54,10 @@ from morphgen.rl.scores import (
 )
 
 LIBRARY = default_library()
+
+
+def score_submission(each, random=None):
+    return score_runs([each], random, "submission")
 
 
 @pytest.fixture

@@ -128,13 +128,6 @@ def method_rows(
     return rows
 
 
-def score_submission(
-    submission: Submission, random: RandomScores | None = None, source: Source = "submission"
-) -> Row:
-    """Compute the scores of a submission that was checked."""
-    return score_runs([submission], random, source)
-
-
 def score_runs(runs: Sequence[Submission], random: RandomScores | None, source: Source) -> Row:
     """Compute the scores of the runs of a method, one for each training seed."""
     first, *_ = runs

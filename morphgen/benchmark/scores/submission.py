@@ -138,9 +138,8 @@ DIGEST = "sha256"
 
 
 def content_digest(data: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of the data of a submission, without that of its file."""
-    content = {key: value for key, value in data.items() if key != DIGEST}
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    """Return the SHA-256 of the data of a submission, which do not hold it yet."""
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
 def submission_text(submission: Submission) -> str:
