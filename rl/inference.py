@@ -322,12 +322,14 @@ def run_episodes(batch: TaskBatch, controller: Controller, count: int) -> list[E
     """Return the first ``count`` episodes of every environment, by environment and then by time."""
     batch.reset()
     n = batch.num_envs
+    batch.is_idle = torch.zeros_like(batch.is_idle)
     results = EpisodeResults(n, count, batch.device)
     on_host = is_host(batch.device)
     num_steps = 0
     while True:
         step = batch.step(controller.act(batch))
         results.add(step)
+        batch.is_idle = results.finished >= count
         num_steps += 1
         if on_host or num_steps % STEPS_UNREAD == 0:
             is_running = results.finished < count

@@ -83,6 +83,8 @@ class TaskBatch:
         action_mask: Links whose joint obeys actions, shape (n, L), bool.
         max_episode_steps: Time limit of episodes, shape (n,) [control steps].
         episode_step: Control steps since the episode began, shape (n,), int64.
+        is_idle: Environments whose results nobody wants any more, shape (n,), bool: they go on, but
+            baselines plan nothing there. Whoever steps the batch sets it.
         decode_actions: Function that decodes actions of a shape (n, L).
         motion: Motion of the joints, of which these are tensors:
         targets: Targets of the independent joints, shape (n, J) [rad or m].
@@ -142,6 +144,7 @@ class TaskBatch:
         self.targets, self.previous_action = self.motion.targets, self.motion.previous_action
         self.previous_qd = self.motion.previous_qd
         self.episode_step = torch.zeros(n, dtype=torch.int64, device=device)
+        self.is_idle = torch.zeros(n, dtype=torch.bool, device=device)
         env_number = torch.arange(first, first + n, device=device)
         self._episodes = EpisodeSequence(seed, env_number)
         # Simulated joints are padded to the largest robot of the simulation, tables perhaps to more

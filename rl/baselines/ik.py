@@ -50,7 +50,7 @@ class InverseKinematics:
             self._planners = {}
         if self._task is not task:
             self._task, self._follower = task, PathFollower(task)
-        new = torch.nonzero(task.episode_step == 0)[:, 0]
+        new = torch.nonzero((task.episode_step == 0) & ~task.is_idle)[:, 0]
         if len(new):
             self._plan(task, new)
         self._follower.advance()

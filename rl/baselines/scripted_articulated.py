@@ -217,9 +217,11 @@ class ScriptedArticulated:
         if self._task is not task:
             self._begin(task)
         position, goal = self._positions(task)
-        new = self.ours & (task.episode_step == 0)
+        ours = self.ours & ~task.is_idle
+        self._active &= ours
+        new = ours & (task.episode_step == 0)
         self._num_plans[new], self._num_failed[new] = 0, 0
-        failed = self._advance(task, position) | (self.ours & ~self._active)
+        failed = self._advance(task, position) | (ours & ~self._active)
         left = (self._num_plans < MAX_PLANS) & (self._num_failed < MAX_FAILED)
         for env in torch.nonzero(new | (failed & left))[:, 0].tolist():
             self._plan(task, env, float(position[env]), float(goal[env]), is_new=bool(new[env]))

@@ -471,7 +471,8 @@ class ScriptedPush:
             self._begin(task)
         block = task.simulation.object_pose
         tool = frame_positions(task.robot_tables.tool_chain, task.env_robot_index, task.q)
-        is_push = task.task_mask("push")
+        is_push = task.task_mask("push") & ~task.is_idle
+        self._active &= is_push
         new = is_push & (task.episode_step == 0)
         self._num_plans[new] = 0
         failed = self._advance(task, block, tool) | (is_push & ~self._active)

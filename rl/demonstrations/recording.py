@@ -329,14 +329,10 @@ def _record_task(
     policy = config.policy_for(spec.task)
     controller_spec = read_controller(policy, spec.task)
     seeds = episode_seeds(config.seed, robot, spec.task, config.episodes)
-    # A planner takes seconds for a plan, and would plan for every environment whose episode ended
-    # before the longest; the networks of a policy take long for each of their calls.
-    planned = controller_spec.learner is None or config.teacher
-    num_envs = 1 if TASKS[spec.task].moves_object and planned else len(seeds)
     simulator = SIMULATORS[config.sim]
     batch = batch_from_specs(
         [spec],
-        num_envs,
+        len(seeds),
         sim=config.sim,
         device=simulator.devices[0],
         workers=1,
@@ -348,16 +344,14 @@ def _record_task(
             teacher = read_controller(best_of(spec.task, config.teacher), spec.task)
             controllers.append(make_controller(teacher, config.seed))
         generator = torch.Generator().manual_seed(seeds[0])
-        for first in range(0, len(seeds), num_envs):
-            own = seeds[first : first + num_envs]
-            results, steps = _run(batch, controllers, own, config, generator)
-            stacked = {k: torch.stack([step[k] for step in steps]).cpu().numpy() for k in steps[0]}
-            for seed, episode in zip(own, results.episodes(batch), strict=True):
-                arrays = {k: v[: episode.steps, episode.env] for k, v in stacked.items()}
-                if not episode.diverged and (episode.success or not config.only_success):
-                    facts = {"task": spec.task, "policy": _named(policy), "seed": seed}
-                    facts |= {k: getattr(episode, k) for k in ("success", "score", "distance")}
-                    yield {**facts, "length": episode.steps}, arrays
+        results, steps = _run(batch, controllers, seeds, config, generator)
+        stacked = {k: torch.stack([step[k] for step in steps]).cpu().numpy() for k in steps[0]}
+        for seed, episode in zip(seeds, results.episodes(batch), strict=True):
+            arrays = {k: v[: episode.steps, episode.env] for k, v in stacked.items()}
+            if not episode.diverged and (episode.success or not config.only_success):
+                facts = {"task": spec.task, "policy": _named(policy), "seed": seed}
+                facts |= {k: getattr(episode, k) for k in ("success", "score", "distance")}
+                yield {**facts, "length": episode.steps}, arrays
 
 
 @one_torch_thread()
@@ -398,6 +392,7 @@ def _run(
         is_held = (successes >= hold) & ~step.terminated
         step = replace(step, truncated=step.truncated | is_held)
         results.add(step)
+        batch.is_idle = results.finished > 0
         values |= {"reward": step.reward, "success": step.success}
         values["done"] = step.terminated | step.truncated
         steps.append(values)
