@@ -7,12 +7,9 @@ from collections.abc import Iterable
 from itertools import takewhile
 from operator import eq
 
-_MAX_LISTED = 24
-"""Largest number of valid names that a hint lists completely."""
-_MAX_SHOWN = 8
-"""Largest number of valid names that a hint shows of a longer list."""
-_MIN_PART = 3
-"""Least length of a name that is near all that contain it [characters]."""
+_MAX_LISTED = 24  # largest number of valid names that a hint lists completely
+_MAX_SHOWN = 8  # largest number of valid names that a hint shows of a longer list
+_MIN_PART = 3  # least length of a name that is near all that contain it [characters]
 _MAX_COMPARED = 200
 """Longest name that is compared with the valid ones [characters]; the time grows quadratically."""
 MALFORMED = (

@@ -27,15 +27,13 @@ from morphgen.progress import STOP_SIGNALS, raise_if_interrupted, report, show_p
 T = TypeVar("T")
 R = TypeVar("R")
 
-CHUNK_SIZE = 8
-"""Default number of items that a worker processes before it reports."""
+CHUNK_SIZE = 8  # default number of items that a worker processes before it reports
 POLL_INTERVAL = 0.2
 """Interval at which workers check whether the parent has stopped, and the parent whether a signal
 was received [s]."""
 CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
 """File in which Linux tells a container how much of the cores it may use."""
-RAY_TIMEOUT = 5.0
-"""Longest wait for the address of a Ray cluster [s]; Ray itself waits for minutes."""
+RAY_TIMEOUT = 5.0  # longest wait for the address of a Ray cluster [s]; Ray itself waits for minutes
 
 _work: Callable[[Any], object]
 _stopped: c_byte | None = None
@@ -55,10 +53,7 @@ def usable_cores() -> int:
 
 
 def parallel_map(
-    work: Callable[[T], R],
-    items: Sequence[T],
-    jobs: int,
-    chunk: int = CHUNK_SIZE,
+    work: Callable[[T], R], items: Sequence[T], jobs: int, chunk: int = CHUNK_SIZE
 ) -> Iterator[R]:
     """Return an iterator over ``work(item)`` for every item, in order; it reports the progress."""
     jobs = whole_number("jobs", jobs, MorphgenError, 1)
@@ -99,10 +94,7 @@ def _reporting(results: Iterable[R], total: int) -> Iterator[R]:
 
 
 def _in_processes(
-    work: Callable[[T], R],
-    chunks: Iterable[Sequence[T]],
-    jobs: int,
-    ahead: Callable[[], int],
+    work: Callable[[T], R], chunks: Iterable[Sequence[T]], jobs: int, ahead: Callable[[], int]
 ) -> Generator[R, None, None]:
     """Yield the results of chunks; ``ahead`` returns how many chunks should be submitted."""
     context = get_context("spawn")  # fork would copy the locks that threads of torch or tqdm hold

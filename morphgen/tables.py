@@ -15,10 +15,8 @@ from morphgen.errors import shortened
 
 _width: ContextVar[int | None] = ContextVar("width", default=None)
 
-_GAP = 2
-"""Width of the gap between two columns, and of tabulate's padding of headers [characters]."""
-_LEAST_TEXT = 16
-"""Least width to which the cells of a column are shortened [characters]."""
+_GAP = 2  # width of the gap between two columns, and of tabulate's padding of headers [characters]
+_LEAST_TEXT = 16  # least width to which the cells of a column are shortened [characters]
 
 
 @contextmanager

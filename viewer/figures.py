@@ -20,8 +20,7 @@ _NUM_BARS, _HISTOGRAM_HEIGHT = 40, 60  # bars of a histogram, and its height in 
 _WIDTH = 480  # width of an SVG in its own units
 _MAP_WIDTH, _MAP_CELL, _MAP_LABEL = 900.0, (100.0, 95.0), 18
 """Width of a map, width and height of a robot with its name, and letters of a name that fit."""
-_MIN_COLUMNS, _MAP_ASPECT = 9, 2.5
-"""Columns of a map of few robots, and columns by rows."""
+_MIN_COLUMNS, _MAP_ASPECT = 9, 2.5  # columns of a map of few robots, and columns by rows
 _BLUES = ((247, 251, 255), (107, 174, 214), (8, 48, 107))  # white to dark blue
 
 

@@ -298,8 +298,7 @@ def _store_thumbnail(gallery: Gallery, uri: str, thumbnail: Thumbnail) -> None:
 def _completed(row: Row, facts: Mapping[str, Any]) -> Row:
     """Return a row with the facts that it lacks, and with the findings of the robot itself."""
     return replace(
-        row,
-        **{k: v for k, v in facts.items() if k == "findings" or getattr(row, k) is None},
+        row, **{k: v for k, v in facts.items() if k == "findings" or getattr(row, k) is None}
     )
 
 

@@ -379,8 +379,7 @@ def _measured(row: Row, robot: Robot) -> Row:
     return replace(row, **facts)  # type: ignore[arg-type]
 
 
-Labels = list[tuple[str, tuple[float, float]]]
-"""Texts on the ground and their positions [m]."""
+Labels = list[tuple[str, tuple[float, float]]]  # texts on the ground and their positions [m]
 
 
 def arrange(population: Population, fact: str = "") -> tuple[Array, Labels]:

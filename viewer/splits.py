@@ -84,11 +84,7 @@ def make_member(uri: str, category: str, task: str, obstacles: bool, files: File
 
 
 def make_members(
-    rows: Sequence[Row],
-    task: str,
-    obstacles: bool,
-    files: FileAccess,
-    workers: Workers,
+    rows: Sequence[Row], task: str, obstacles: bool, files: FileAccess, workers: Workers
 ) -> list[Member]:
     """Compose the robots of rows in the worker processes; return them as members of a split."""
     futures = [
@@ -120,11 +116,7 @@ def save_split(
     return path
 
 
-def study_split(
-    split: Split,
-    folders: tuple[Path, ...],
-    workers: Workers,
-) -> SplitStudy:
+def study_split(split: Split, folders: tuple[Path, ...], workers: Workers) -> SplitStudy:
     """Measure and compare a split's robots in worker processes."""
     members = [*split.train, *split.test]
     if len(members) > MAX_ROBOTS:

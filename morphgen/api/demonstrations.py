@@ -323,8 +323,7 @@ def clone(
     return run
 
 
-MAX_EPOCHS = 100_000
-"""Most passes over the steps of demonstrations."""
+MAX_EPOCHS = 100_000  # most passes over the steps of demonstrations
 
 
 def _cloning_config(

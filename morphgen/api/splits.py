@@ -240,10 +240,8 @@ class LoadedSplit:
         return verify(self.folder, self.library, jobs=jobs).differences
 
 
-Names = str | Sequence[str]
-"""One name, or several."""
-DEFAULT_TRAIN = 10
-"""Number of train robots; a split of compositions has all that may be trained on."""
+Names = str | Sequence[str]  # one name, or several
+DEFAULT_TRAIN = 10  # number of train robots; a split of compositions has all that may be trained on
 
 
 class NewSplit(TypedDict, total=False):
@@ -376,8 +374,7 @@ _RULES: Mapping[Regime, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "hold-out": (("hold_out",), ("robots", "grammar")),
 }
 """Arguments that a regime needs, and further ones that have an effect."""
-MAX_WORD = 60
-"""Largest number of characters of what is held out in the name of a split."""
+MAX_WORD = 60  # largest number of characters of what is held out in the name of a split
 Rules = Mapping[str, tuple[str, ...]]
 """Arguments of ``split`` by which robots are chosen, without those that are not given."""
 

@@ -40,8 +40,7 @@ class TaskSummary:
     robots: int
     episodes: int
     steps: int
-    success: Interval
-    """Share of the episodes that ended in success, with its 95% Wilson interval."""
+    success: Interval  # share of the episodes that ended in success, with its 95% Wilson interval
 
 
 def summarize(demos: Demonstrations) -> list[TaskSummary]:
@@ -77,8 +76,7 @@ def summary_text(demos: Demonstrations, style: str = "simple") -> str:
 class Verification:
     """Result of verifying demonstrations."""
 
-    replays: tuple[Replay, ...]
-    """Simulated episodes beside the recorded ones."""
+    replays: tuple[Replay, ...]  # simulated episodes beside the recorded ones
     changed_files: tuple[str, ...]
     """Files that are missing, were added, or differ from ``SHA256SUMS``."""
 
@@ -105,10 +103,7 @@ def describe(demos: Demonstrations) -> None:
     if (folder / SUMS_FILE).is_file():
         return
     parts = _licenced_parts(folder)
-    texts = {
-        **licence_files(parts),
-        README_FILE: _card(demos, parts),
-    }
+    texts = {**licence_files(parts), README_FILE: _card(demos, parts)}
     for name, text in texts.items():
         write_atomic(folder / name, text)
     write_atomic(folder / CROISSANT_FILE, _croissant(demos, parts, folder_hashes(folder)))

@@ -19,10 +19,8 @@ from matplotlib.transforms import Bbox
 from morphgen.encoding.similarity import classical_mds, get_measure, to_distances
 from morphgen.typing import Array
 
-MAX_NAMED = 60
-"""Largest number of robots whose names are drawn."""
-MAX_WITH_VALUES = 16
-"""Largest number of robots whose values are written into the cells."""
+MAX_NAMED = 60  # largest number of robots whose names are drawn
+MAX_WITH_VALUES = 16  # largest number of robots whose values are written into the cells
 
 _DPI = 100
 _ROW_HEIGHT = 0.19  # height of a named row of a heatmap [inches]
@@ -31,8 +29,7 @@ _MIN_SIDE, _UNNAMED_SIDE = 3.2, 8.0
 """Smallest side of a heatmap, and side of one without names [inches]."""
 _LABEL_DISTANCES = (9, 16, 26, 40, 58, 80)
 """Distances of a name from its point, tried in turn [pixels]."""
-_MARKERS = "o^"
-"""Markers of groups of robots: each with all colours, one after another."""
+_MARKERS = "o^"  # markers of groups of robots: each with all colours, one after another
 _ALL_NAMED, _SOME_NAMED, _APART = 20, 30, 16.0
 """Largest number of robots of a map that are all named; of more, number of names, and least
 distance of points that are named [pixels]."""

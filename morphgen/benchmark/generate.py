@@ -13,12 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morphgen.benchmark.regimes import (
-    HULLS,
-    RuledRobot,
-    pattern_robots,
-    regime_violations,
-)
+from morphgen.benchmark.regimes import HULLS, RuledRobot, pattern_robots, regime_violations
 from morphgen.encoding.similarity import cosine, is_near
 from morphgen.encoding.tokens import MAX_LINKS, require_max_links
 from morphgen.errors import BenchmarkError, nearest
@@ -58,14 +53,12 @@ MAX_COMPOSED = 200
 class SplitRequest:
     """Request for one or several splits, of any regime."""
 
-    name: str
-    """Name of the split; with several sizes ``-train30`` and so on is appended."""
+    name: str  # name of the split; with several sizes `-train30` and so on is appended
     train: tuple[int, ...]
     """Numbers of train robots, one per split. The splits share their test robots, and the train
     robots of a smaller split are the first of a larger one. If robots are chosen from a list, an
     empty tuple means all."""
-    test: int
-    """Number of test robots."""
+    test: int  # number of test robots
     tasks: tuple[str, ...] = ("reach",)
     obstacles: bool = False
     seed: int = 0

@@ -47,8 +47,7 @@ from morphgen.splits.candidates import (
 )
 from morphgen.splits.split import HOLD_OUT, HOLD_OUT_KEY, Member, Side, Split
 
-MANUFACTURER = "manufacturer"
-"""Key of conditions on the manufacturer of a part."""
+MANUFACTURER = "manufacturer"  # key of conditions on the manufacturer of a part
 EXAMPLES = "arm=kinova*, manufacturer=Kinova, arm3.length=0.3..0.4 or arm=ur5+ee=plane"
 """Examples of rules, for messages."""
 
@@ -237,8 +236,7 @@ class _Draft:
     rules: tuple[int, ...]
     """Numbers of the rules that hold for the robot; none if it may be trained on."""
     parts: frozenset[str]
-    required: frozenset[str]
-    """Parts that some train robot must have if this is a test robot."""
+    required: frozenset[str]  # parts that some train robot must have if this is a test robot
     strata: tuple[list[_Item], ...]
     """Groups of items whose numbers are balanced, the most important group first: rules, parts that
     they hold for (alone or in a combination), category, and parts by their kind."""
@@ -430,8 +428,7 @@ def _stratified(
     return chosen
 
 
-MAX_REJECTED = 500
-"""Number of rejected robots after which the search fails."""
+MAX_REJECTED = 500  # number of rejected robots after which the search fails
 
 
 def _composed(factory: RobotFactory, draft: _Draft) -> Candidate | str:
@@ -688,8 +685,7 @@ def _finding(code: str, side: Side, member: Member, why: str, fix: str) -> Findi
     return Finding(code, "error", f"{side} robot {member.name}", why, fix)
 
 
-DEFAULT_PATTERN = "arm=* ee=*"
-"""Robots that are drawn from if nothing is named."""
+DEFAULT_PATTERN = "arm=* ee=*"  # robots that are drawn from if nothing is named
 
 
 def hold_out(

@@ -26,8 +26,7 @@ from morphgen.model.findings import Finding
 from morphgen.splits.candidates import Candidate, DerivedRecipe, recipe_of
 from morphgen.splits.split import COMPOSED, Member, Regime, Split
 
-NOTHING = "none"
-"""Name of the part for robots without an end-effector."""
+NOTHING = "none"  # name of the part for robots without an end-effector
 _CHOICE = re.compile(r"\{([^{}]*)\}")
 _WILDCARD = re.compile(r"[*?[]")
 
@@ -257,15 +256,11 @@ class RuledRobot:
         return list(parameters(self.derivation, self.library).values())
 
 
-Violation = tuple[str, str, str]
-"""Code, reason and fix of what a test robot violates."""
+Violation = tuple[str, str, str]  # code, reason and fix of what a test robot violates
 
 
 def regime_violations(
-    regime: Regime,
-    provenance: Mapping[str, object],
-    test: RuledRobot,
-    train: Sequence[RuledRobot],
+    regime: Regime, provenance: Mapping[str, object], test: RuledRobot, train: Sequence[RuledRobot]
 ) -> Iterator[Violation]:
     """Yield how a test robot violates the rule of a regime; see ``regime_findings``.
 

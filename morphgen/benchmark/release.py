@@ -122,22 +122,16 @@ _URL = re.compile(r"https?://[^\s\"<>]{1,500}")
 class Release(Record, frozen=True):
     """The content of ``release.json``."""
 
-    name: str
-    """Name of the split."""
-    id: str
-    """Id of the split, see ``morphgen.splits.split.split_id``."""
-    version: str
-    """Version of the release, such as ``1.0.0``."""
-    morphgen: str
-    """Version of morphgen that made it."""
+    name: str  # name of the split
+    id: str  # id of the split, see `morphgen.splits.split.split_id`
+    version: str  # version of the release, such as `1.0.0`
+    morphgen: str  # version of morphgen that made it
     evaluation: dict[str, Any]
     """How submissions are evaluated, see ``morphgen.benchmark.scores.submission``."""
     format: int = FORMAT
-    date: str = ""
-    """Date of publication, such as ``2027-01-31``; empty if it is not given."""
+    date: str = ""  # date of publication, such as `2027-01-31`; empty if it is not given
     creators: tuple[str, ...] = ()
-    url: str = ""
-    """Address of the release; empty if it is not given."""
+    url: str = ""  # address of the release; empty if it is not given
     difficulty: dict[str, Any] = msgspec.field(default_factory=dict)
     """Cosine similarity of test and train robots, and the nearest train robot by each measure."""
 
@@ -253,8 +247,7 @@ def citation(split: Split, release: Release) -> str:
     )
 
 
-MAX_ROWS = 20
-"""Largest number of test robots in the table of the card."""
+MAX_ROWS = 20  # largest number of test robots in the table of the card
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 """Size categories of Hugging Face by their upper bound."""
 

@@ -77,16 +77,13 @@ ROBOTS_DIR = "robots"
 README_FILE = "README.md"
 BUILD_FILE = "build.json"
 SUMS_FILE = "SHA256SUMS"
-ARCHIVE_SUFFIX = ".zip"
-"""Suffix of the archive of a release, see ``morphgen.benchmark.release``."""
+ARCHIVE_SUFFIX = ".zip"  # suffix of the archive of a release, see `morphgen.benchmark.release`
 
-FORMAT = 1
-"""Version of the folder's layout."""
+FORMAT = 1  # version of the folder's layout
 
 _SUM = re.compile(r"([0-9a-f]{64})  (.+)")
 
-Record = dict[str, Any]
-"""A line of ``robots.jsonl``."""
+Record = dict[str, Any]  # a line of `robots.jsonl`
 
 
 @dataclass(frozen=True, eq=False)

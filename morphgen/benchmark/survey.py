@@ -205,8 +205,7 @@ def _compare(known: Sequence[Features | None], compared: NDArray[np.bool_], inde
     return values
 
 
-DIGITS = 4
-"""Decimals of the statistics."""
+DIGITS = 4  # decimals of the statistics
 COUNTED = ("links", "movable", "movable_to_tool")
 MEASURED = ("mass", "reach")
 COSINE = "cosine"

@@ -38,15 +38,7 @@ from morphgen.model.kinematics import (
     movable_positions,
     random_configurations,
 )
-from morphgen.model.robot import (
-    DEFAULT_EFFORT,
-    DEFAULT_VELOCITY,
-    TOOL,
-    Frame,
-    Joint,
-    Mimic,
-    Robot,
-)
+from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, TOOL, Frame, Joint, Mimic, Robot
 from morphgen.typing import Array
 
 POSITION_TOLERANCE = 1e-5  # largest accepted distance between a loader's tool and morphgen's [m]
@@ -81,14 +73,10 @@ BUNDLE, FILE = "bundle", "file"  # sources of a row
 class ConformanceRow:
     """Result of one loader."""
 
-    loader: str
-    """Name of the loader and its file."""
-    passed: bool | None
-    """Whether the loader agrees with morphgen; None if it is not installed."""
-    joints: bool | None = None
-    """Whether the loader has the same movable joints, by name."""
-    mass: float | None = None
-    """Total mass [kg]."""
+    loader: str  # name of the loader and its file
+    passed: bool | None  # whether the loader agrees with morphgen; None if it is not installed
+    joints: bool | None = None  # whether the loader has the same movable joints, by name
+    mass: float | None = None  # total mass [kg]
     position_error: float | None = None
     """Largest distance between the frame and morphgen's over all configurations [m]."""
     rotation_error: float | None = None
@@ -96,22 +84,17 @@ class ConformanceRow:
     limits: bool | None = None
     """Whether position, effort and velocity limits agree; None, here and below, if the loader reads
     no such values."""
-    mimic: bool | None = None
-    """Whether leader, multiplier and offset of mimic joints agree."""
-    damping: bool | None = None
-    """Whether damping and friction agree."""
-    gains: bool | None = None
-    """Whether gains and armature of the position actuators agree."""
+    mimic: bool | None = None  # whether leader, multiplier and offset of mimic joints agree
+    damping: bool | None = None  # whether damping and friction agree
+    gains: bool | None = None  # whether gains and armature of the position actuators agree
     gravity_error: float | None = None
     """Largest difference of a force that holds the weight [N m or N]; None, here and below, if the
     loader computes none."""
     inertia_error: float | None = None
     """Largest difference of an entry of the joint-space inertia, relative to the root of the
     product of its two diagonal entries."""
-    message: str = ""
-    """Description of the disagreement, or ``not installed``."""
-    source: str = BUNDLE
-    """``bundle``, or ``file`` if the loader read the file of others as it is."""
+    message: str = ""  # description of the disagreement, or `not installed`
+    source: str = BUNDLE  # `bundle`, or `file` if the loader read the file of others as it is
     causes: tuple[str, ...] = ()
     """The deviations of the loader that explain all its differences from morphgen."""
 
@@ -125,19 +108,14 @@ class ConformanceRow:
 class ConformanceReport:
     """Results of all loaders for one bundle."""
 
-    robot: str
-    """Name of the robot."""
-    frame: str
-    """Name of the compared frame or link."""
-    samples: int
-    """Number of configurations."""
-    seed: int
-    """Seed of the configurations."""
+    robot: str  # name of the robot
+    frame: str  # name of the compared frame or link
+    samples: int  # number of configurations
+    seed: int  # seed of the configurations
     passed: bool
     """Whether every installed loader agrees, or differs on a file of others with known causes, and,
     if measured, the robot holds its home and steps from it."""
-    rows: tuple[ConformanceRow, ...]
-    """The loaders."""
+    rows: tuple[ConformanceRow, ...]  # the loaders
     holds: tuple[HoldRow, ...] = ()
     """The simulators in which the robot holds its home configuration, and steps from it."""
     penetrations: Mapping[str, float] = field(default_factory=dict)

@@ -78,17 +78,14 @@ class SimulatedRobot:
 class HoldRow:
     """How a robot holds its home configuration in a simulator, and how its joints step."""
 
-    simulator: str
-    """Name of the simulator, and of the file or the environments."""
+    simulator: str  # name of the simulator, and of the file or the environments
     passed: bool | None
     """Whether no joint drifts farther than ``MAX_DRIFT`` from home, all steps settle within
     ``STEP_S`` and mimic joints stay with their leaders; None without the simulator."""
     drift: float | None = None
     """Largest distance of a joint from home within ``HOLD_S`` [rad or m]; None if diverged."""
-    unit: str = ""
-    """Unit of ``drift``: ``rad`` or ``m``."""
-    joint: str = ""
-    """Name of the joint that drifts farthest."""
+    unit: str = ""  # unit of `drift`: `rad` or `m`
+    joint: str = ""  # name of the joint that drifts farthest
     step_error: float | None = None
     """Largest distance of a joint from its target at the end of a step [rad or m]; None, here and
     below, if a step diverged."""
@@ -96,10 +93,8 @@ class HoldRow:
     """Largest distance of a mimic joint from its leader's position during a step [rad or m]."""
     settling_time: float | None = None
     """Longest time until all joints are within ``BAND`` of their targets [s]; None if never."""
-    message: str = ""
-    """Description of the failure; empty if the robot passed."""
-    causes: tuple[str, ...] = ()
-    """Known causes of the failure; empty if none is known."""
+    message: str = ""  # description of the failure; empty if the robot passed
+    causes: tuple[str, ...] = ()  # known causes of the failure; empty if none is known
 
     @property
     def is_unexplained(self) -> bool:

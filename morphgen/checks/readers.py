@@ -80,8 +80,7 @@ class Loader:
 
     name: str  # name of the loader and its file
     module: str  # import name of the library
-    read: Read
-    """Reads the file; raises ``FormatError`` if the library rejects it or lacks the frame."""
+    read: Read  # reads the file; raises `FormatError` if the library rejects it or lacks the frame
     file: str  # the bundle's file that it reads
 
 

@@ -143,10 +143,8 @@ _SIMULATOR_COLUMNS = {
     "settles in s": "settling_time",
 }
 """Fields of ``HoldRow`` by the titles of their columns."""
-_MAX_CELL = 22
-"""Number of characters of a robot's or joint's name in a table."""
-_MAX_NOTE = 400
-"""Number of characters of a row's message; ``--json`` has all."""
+_MAX_CELL = 22  # number of characters of a robot's or joint's name in a table
+_MAX_NOTE = 400  # number of characters of a row's message; `--json` has all
 
 
 def _conformance_text(reports: Mapping[str, ConformanceReport]) -> str:

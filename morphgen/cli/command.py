@@ -37,8 +37,7 @@ _VALUE = re.compile(
 _RULE = re.compile(r"(--[^:]+): only (with|without) (--[\w-]+)(?:=(\S+))?")
 Names: TypeAlias = Callable[[], Mapping[str, Any]]
 """Function that returns what stands for the names in ``commands.txt``; see ``_names``."""
-_PATHS = re.compile(r"DIR|FOLDER|PATH|FILE\b.*")
-"""Words for a value that is a path."""
+_PATHS = re.compile(r"DIR|FOLDER|PATH|FILE\b.*")  # words for a value that is a path
 
 
 class UsageError(MorphgenError):
@@ -49,25 +48,20 @@ class UsageError(MorphgenError):
 class Command:
     """A command, or a group of commands such as ``morphgen split``."""
 
-    path: str
-    """Words of the command line, such as ``split new``."""
+    path: str  # words of the command line, such as `split new`
     function: str = ""
     """Module of ``morphgen.cli`` and its function that runs the command, which gets the arguments
     and may return an exit code; empty for a group that needs one of its commands."""
     extra: str = ""
     """Extra of morphgen that the command needs, which errors name if a package is missing."""
-    summary: str = ""
-    """Purpose of the command: a verb and its object, without a full stop."""
-    details: str = ""
-    """Sentences that follow the summary in the command's own help."""
-    examples: list[str] = field(default_factory=list)
-    """Command lines that the help shows."""
+    summary: str = ""  # purpose of the command: a verb and its object, without a full stop
+    details: str = ""  # sentences that follow the summary in the command's own help
+    examples: list[str] = field(default_factory=list)  # command lines that the help shows
     options: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Keyword arguments of ``ArgumentParser.add_argument`` by flag, or name of a position."""
     basic: Sequence[str] = ()
     """Options that ``--help`` shows if ``--help-all`` shows more; empty if there are no others."""
-    alternatives: list[list[str]] = field(default_factory=list)
-    """Flags that exclude each other."""
+    alternatives: list[list[str]] = field(default_factory=list)  # flags that exclude each other
     rules: list[tuple[list[str], str, str, list[str]]] = field(default_factory=list)
     """Flags that have an effect ``with`` or ``without`` another only, the other, and those of its
     values that count, all if there are none."""

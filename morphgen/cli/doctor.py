@@ -31,8 +31,7 @@ def demo(args: argparse.Namespace) -> int:
     return 0
 
 
-STATUS_WIDTH = 8
-"""Width of the first column [characters]."""
+STATUS_WIDTH = 8  # width of the first column [characters]
 
 
 def doctor(args: argparse.Namespace) -> int:

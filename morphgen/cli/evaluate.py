@@ -100,8 +100,7 @@ def speed(args: argparse.Namespace) -> None:
     opt.print_result(args, data, text)
 
 
-FILM_EPISODES = 3
-"""Number of episodes in a video."""
+FILM_EPISODES = 3  # number of episodes in a video
 
 
 def zeroshot(args: argparse.Namespace) -> None:

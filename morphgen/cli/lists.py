@@ -45,8 +45,7 @@ def list_grammars(args: argparse.Namespace) -> None:
     opt.print_result(args, rows, lambda: table(cells, ("name", "robots")))
 
 
-SHORT_DERIVATION = 60
-"""Number of characters of a derivation that ``show`` prints without ``--full``."""
+SHORT_DERIVATION = 60  # number of characters of a derivation that `show` prints without `--full`
 
 
 def list_splits(args: argparse.Namespace) -> None:

@@ -26,10 +26,8 @@ if TYPE_CHECKING:  # tqdm is loaded when a bar is drawn
 
 T = TypeVar("T")
 
-FIRST_LINE = 2.0
-"""Time after which a line says what is done, where there is no terminal [s]."""
-LINE_INTERVAL = 10.0
-"""Time between two further lines [s]."""
+FIRST_LINE = 2.0  # time after which a line says what is done, where there is no terminal [s]
+LINE_INTERVAL = 10.0  # time between two further lines [s]
 REDRAW_INTERVAL = 1.0
 """Time after which a bar appears, and between its updates if nothing else happens [s]."""
 

@@ -25,8 +25,7 @@ from morphgen.model.robot import Joint, Robot
 
 RECORDING = "recording.json"
 """File that every folder of demonstrations has, see ``morphgen.rl.demonstrations``."""
-_PARTS = Path("parts")
-"""Folder of the manifests that ``morphgen import --part`` writes by default."""
+_PARTS = Path("parts")  # folder of the manifests that `morphgen import --part` writes by default
 
 
 def compose(args: argparse.Namespace) -> int:

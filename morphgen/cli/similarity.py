@@ -41,8 +41,7 @@ from morphgen.tables import fits, fitted, is_whole, table
 from morphgen.typing import Array
 
 MEASURES = ("cosine", "tree", "workspace", "all")
-LARGEST_MATRIX = 20
-"""Largest number of robots whose matrix is printed."""
+LARGEST_MATRIX = 20  # largest number of robots whose matrix is printed
 
 
 def similarity(args: argparse.Namespace) -> None:

@@ -108,8 +108,7 @@ def goals(args: argparse.Namespace) -> int:
     return int(not sets.passed)
 
 
-MAX_LISTED = 10
-"""Largest number of findings of one code, or of differences, that are printed."""
+MAX_LISTED = 10  # largest number of findings of one code, or of differences, that are printed
 
 
 def audit(args: argparse.Namespace) -> int:

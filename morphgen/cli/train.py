@@ -38,13 +38,7 @@ from morphgen.cli import options as opt
 from morphgen.cli.progress import note, status, training_progress
 from morphgen.errors import TaskError, nearest
 from morphgen.rl.agents import AGENTS
-from morphgen.rl.config import (
-    OBSERVATION_SWITCHES,
-    SWITCHES,
-    PPOConfig,
-    parse_agent,
-    parse_agents,
-)
+from morphgen.rl.config import OBSERVATION_SWITCHES, SWITCHES, PPOConfig, parse_agent, parse_agents
 from morphgen.rl.evaluation import EvalConfig, episodes_for
 from morphgen.rl.runs.checkpoint import RunConfig, read_checkpoint
 from morphgen.rl.runs.robot_source import (
@@ -74,10 +68,8 @@ from morphgen.tasks.registry import (
 from morphgen.tasks.scenes.env_specs import IN_EVERY_FILE, GoalConfig, default_configs
 
 RESUME = "with --resume"
-FINETUNING_STEPS = 100_000
-"""Number of control steps of ``finetune`` by default."""
-FINETUNING_ENVS = 64
-"""Number of environments of ``finetune`` by default."""
+FINETUNING_STEPS = 100_000  # number of control steps of `finetune` by default
+FINETUNING_ENVS = 64  # number of environments of `finetune` by default
 
 
 def agent_text(args: argparse.Namespace) -> str:
@@ -179,8 +171,7 @@ def _finetuning_config(file: Path, folder: Path, args: argparse.Namespace) -> Ru
     )
 
 
-PAPER = "paper"
-"""Word for all splits of the benchmark."""
+PAPER = "paper"  # word for all splits of the benchmark
 
 
 def study(args: argparse.Namespace) -> int:

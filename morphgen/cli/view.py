@@ -15,13 +15,11 @@ from morphgen.cli.progress import note
 from morphgen.progress import STOP_SIGNALS
 from morphgen.viewer.app.app import Viewer, serve
 
-SIGNAL_POLL = 0.5
-"""Longest delay before a signal is handled [s]."""
+SIGNAL_POLL = 0.5  # longest delay before a signal is handled [s]
 QUIET_TIME = 2.0
 """Time without work for a browser after which the first rollout is prepared [s]: the first page
 draws pictures, which would take longer beside it."""
-STOP_GRACE = 5.0
-"""Time in which work has to end after a signal; then it is given up [s]."""
+STOP_GRACE = 5.0  # time in which work has to end after a signal; then it is given up [s]
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
 
 

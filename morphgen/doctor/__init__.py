@@ -25,14 +25,11 @@ Status = Literal["ok", "absent", "warning", "error"]
 class Entry:
     """One result."""
 
-    name: str
-    """Name of what was examined, such as ``simulator mujoco``."""
+    name: str  # name of what was examined, such as `simulator mujoco`
     status: Status
     """``absent`` for an optional package, ``error`` if morphgen does not work as documented."""
-    text: str
-    """Result, and what to do about it if it is not ``ok``; one line."""
-    data: Mapping[str, object] = field(default_factory=dict)
-    """Values of the text, for programs."""
+    text: str  # result, and what to do about it if it is not `ok`; one line
+    data: Mapping[str, object] = field(default_factory=dict)  # values of the text, for programs
 
     def as_dict(self) -> dict[str, Any]:
         """Return the result as JSON values."""

@@ -34,14 +34,10 @@ from morphgen.splits.split_file import read_split, split_names
 from morphgen.tasks.goals.goal_sets import FOLDER, packaged_index
 from morphgen.tasks.registry import SIMULATORS
 
-ROBOT = "ur5-plane"
-"""Robot of the self-test: a real arm with meshes, and a template."""
-CONFIGURATIONS = 5
-"""Number of random configurations in which loaders are compared."""
-PICTURE_SIZE = (160, 120)
-"""Width and height of the picture [px]."""
-STEP = 0.1
-"""Distance of the target of the simulators' step from the home position [rad]."""
+ROBOT = "ur5-plane"  # robot of the self-test: a real arm with meshes, and a template
+CONFIGURATIONS = 5  # number of random configurations in which loaders are compared
+PICTURE_SIZE = (160, 120)  # width and height of the picture [px]
+STEP = 0.1  # distance of the target of the simulators' step from the home position [rad]
 ROS_VARIABLES = ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH")
 """Environment variables with folders in which meshes of imported robots are searched first."""
 

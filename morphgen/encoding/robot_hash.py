@@ -21,8 +21,7 @@ from morphgen.model.robot import (
 )
 from morphgen.model.rotation import to_matrix
 
-HASH_LENGTH = 32
-"""Hexadecimal digits of the hash of a robot and of the id of a split: 128 bits."""
+HASH_LENGTH = 32  # hexadecimal digits of the hash of a robot and of the id of a split: 128 bits
 _GRID = 1e-7
 """Resolution of the numbers in a hash: lengths [m], angles [rad], masses [kg] and others."""
 _GYRATION_GRID = 1e-9  # resolution of inertia over mass [m^2]; a finger has 1e-5

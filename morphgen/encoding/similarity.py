@@ -29,10 +29,8 @@ from morphgen.model.rotation import Vec3
 from morphgen.progress import report
 from morphgen.typing import Array
 
-SAMPLES = 65_536
-"""Number of random configurations."""
-CELLS = 10
-"""Number of grid cells between the shoulder and the farthest tool position."""
+SAMPLES = 65_536  # number of random configurations
+CELLS = 10  # number of grid cells between the shoulder and the farthest tool position
 
 _PARALLEL = 0.5  # sine of the angle below which two axes count as parallel
 _IMMOBILE = 1e-9  # distance from the shoulder below which a tool counts as immobile [m]

@@ -15,30 +15,19 @@ from morphgen.arguments import whole_number
 from morphgen.errors import BenchmarkError, RobotError, nearest
 from morphgen.formats.rounding import as_written
 from morphgen.model import rotation
-from morphgen.model.geometry import (
-    IDENTITY,
-    Box,
-    Capsule,
-    Cylinder,
-    Geometry,
-    Pose,
-    Shape,
-    Sphere,
-)
+from morphgen.model.geometry import IDENTITY, Box, Capsule, Cylinder, Geometry, Pose, Shape, Sphere
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import TOOL, Frame, Joint, JointKind, Link, Robot
 from morphgen.typing import Array
 
 TOKEN_SIZE = 48
-MAX_LINKS = 23
-"""Number of links of the paper's largest robot: 22 and the base."""
+MAX_LINKS = 23  # number of links of the paper's largest robot: 22 and the base
 LARGEST_MAX_LINKS = 10_000
 """Largest ``max_links``: a robot's tokens have as many rows, so a larger one fills the memory."""
 TOLERANCE = 1e-4
 """Largest error of a number that is still decoded; single-precision tokens are within it."""
 
-SHAPES = ("sphere", "cylinder", "box")
-"""Order of the one-hot encoding of a geometry."""
+SHAPES = ("sphere", "cylinder", "box")  # order of the one-hot encoding of a geometry
 KINDS: tuple[JointKind, ...] = ("prismatic", "revolute", "fixed")
 """Order of the one-hot encoding of a joint type."""
 FREQUENCIES: Array = np.array([math.pi / 2 * 2**k for k in range(8)])

@@ -36,14 +36,10 @@ from morphgen.model.robot import Pair, Robot, sorted_pair
 class Agreement:
     """Numbers of configurations in which meshes and a substitute (primitives, hulls) collide."""
 
-    both: int
-    """Both the meshes and the substitute collide."""
-    neither: int
-    """Neither the meshes nor the substitute collide."""
-    only_meshes: int
-    """The meshes collide, the substitute does not."""
-    only_other: int
-    """The substitute collides, the meshes do not."""
+    both: int  # both the meshes and the substitute collide
+    neither: int  # neither the meshes nor the substitute collide
+    only_meshes: int  # the meshes collide, the substitute does not
+    only_other: int  # the substitute collides, the meshes do not
 
     @property
     def precision(self) -> float:

@@ -58,8 +58,7 @@ class LinkFit:
 
     primitives: tuple[Shape, ...]  # boxes, cylinders and spheres in the link frame
     single: Shape | None  # the single primitive of largest overlap; None if it was not searched for
-    solid: str
-    """How the solid was made, see ``solid.Method``; ``primitives`` if the shapes were kept."""
+    solid: str  # how the solid was made, see `solid.Method`; `primitives` if the shapes were kept
     quality: Quality
     seconds: float  # duration of the fit [s]; 0 for a link that shares the fit of a congruent one
     decimated_from: int | None = None

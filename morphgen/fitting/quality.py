@@ -32,24 +32,16 @@ more takes four times as long, most of it for the union of spheres."""
 class Quality:
     """Measured agreement of a union of primitives with a solid."""
 
-    iou: float
-    """Volume of the intersection over the volume of the union."""
-    coverage: float
-    """Share of the solid's volume that is inside the primitives."""
-    volume_ratio: float
-    """Volume of the union of the primitives over the volume of the solid."""
-    protrusion_share: float
-    """Share of the primitives' outer surface that is outside of the solid."""
+    iou: float  # volume of the intersection over the volume of the union
+    coverage: float  # share of the solid's volume that is inside the primitives
+    volume_ratio: float  # volume of the union of the primitives over the volume of the solid
+    protrusion_share: float  # share of the primitives' outer surface that is outside of the solid
     protrusion_mean: float
     """Mean distance of the primitives' outer surface from the solid, 0 where inside [m]."""
-    protrusion_p95: float
-    """95th percentile of that distance over the surface [m]."""
-    gap_mean: float
-    """Mean distance of the solid's surface from the primitives, 0 where inside [m]."""
-    gap_p95: float
-    """95th percentile of that distance over the surface [m]."""
-    hausdorff: float
-    """Largest distance of a point of either surface to the other surface [m]."""
+    protrusion_p95: float  # 95th percentile of that distance over the surface [m]
+    gap_mean: float  # mean distance of the solid's surface from the primitives, 0 where inside [m]
+    gap_p95: float  # 95th percentile of that distance over the surface [m]
+    hausdorff: float  # largest distance of a point of either surface to the other surface [m]
 
 
 def quality(

@@ -180,9 +180,7 @@ def _fit_and_keep(
     from morphgen.fitting.robot_fit import fit_links, fits_of  # needs the extra fit
 
     _LOGGER.warning(
-        "fitting primitives to %d links of robot %r; the fits are kept",
-        len(links),
-        robot.name,
+        "fitting primitives to %d links of robot %r; the fits are kept", len(links), robot.name
     )
     names = [link.name for link in links]
     report = fit_links(robot, options, only=names, jobs=jobs)

@@ -50,8 +50,7 @@ NEAR, FAR = 0.02, 0.35
 """Margins of their boxes around the bounding box, relative to the solid's size."""
 NUM_CLUSTERINGS = 4  # number of clusterings from which the search for several primitives starts
 DIGITS = 6  # decimals of dimensions and positions in metres; quaternions have three more
-NUM_SPHERE_CLUSTERINGS = 3
-"""Number of clusterings from which the search for spheres starts."""
+NUM_SPHERE_CLUSTERINGS = 3  # number of clusterings from which the search for spheres starts
 EMPHASES = (6.0, 20.0, 100.0)
 """Weights of points inside, relative to points outside, of fits that must cover the solid; tuned on
 the Panda and the UR5. The best one is larger the thinner the solid and the fewer the spheres."""
@@ -110,8 +109,7 @@ class Round:
     steps: int  # number of steps of the gradient ascent
     tau: tuple[float, float]
     """Softness of the membership in the first and last step [sizes of the solid]."""
-    rate: tuple[float, float]
-    """Learning rate in the first and last step [sizes of the solid]."""
+    rate: tuple[float, float]  # learning rate in the first and last step [sizes of the solid]
 
 
 NUM_COUNTED = 2**13  # number of points that select candidates between rounds
@@ -121,10 +119,7 @@ ROUNDS = (
     Round(2, NEAR_POINTS + FAR_POINTS, 60, (0.006, 0.0015), (0.004, 0.0004)),
 )
 """Rounds of the search for one primitive, and for spheres."""
-SEVERAL_ROUNDS = (
-    replace(ROUNDS[0], tau=(0.02, 0.006)),
-    replace(ROUNDS[1], candidates=4, steps=50),
-)
+SEVERAL_ROUNDS = (replace(ROUNDS[0], tau=(0.02, 0.006)), replace(ROUNDS[1], candidates=4, steps=50))
 """Rounds of the search for several primitives, which has more and finer optima."""
 
 

@@ -85,8 +85,7 @@ class NamedDescription:
     """The file of a robot, and what its collection says about it."""
 
     path: Path
-    args: Mapping[str, str] = field(default_factory=dict)
-    """Arguments of a xacro."""
+    args: Mapping[str, str] = field(default_factory=dict)  # arguments of a xacro
     licence: str = ""
     """SPDX identifier of the robot's licence; empty if the collection does not say."""
 

@@ -55,16 +55,12 @@ _KINDS = {Box: "box", Cylinder: "cylinder", Sphere: "sphere", Capsule: "capsule"
 class ShapeRecord(Record, frozen=True):
     """A primitive as a file holds it; exactly one of the four sizes is given."""
 
-    xyz: tuple[FiniteNumber, FiniteNumber, FiniteNumber]
-    """Position in the link frame [m]."""
+    xyz: tuple[FiniteNumber, FiniteNumber, FiniteNumber]  # position in the link frame [m]
     quaternion: tuple[FiniteNumber, FiniteNumber, FiniteNumber, FiniteNumber]
     """Orientation in the link frame (w, x, y, z)."""
-    box: tuple[PositiveNumber, PositiveNumber, PositiveNumber] | None = None
-    """Edge lengths [m]."""
-    cylinder: tuple[PositiveNumber, PositiveNumber] | None = None
-    """Radius and length [m]."""
-    sphere: tuple[PositiveNumber] | None = None
-    """Radius [m]."""
+    box: tuple[PositiveNumber, PositiveNumber, PositiveNumber] | None = None  # edge lengths [m]
+    cylinder: tuple[PositiveNumber, PositiveNumber] | None = None  # radius and length [m]
+    sphere: tuple[PositiveNumber] | None = None  # radius [m]
     capsule: tuple[PositiveNumber, PositiveNumber] | None = None
     """Radius, and length without the caps [m]."""
 
@@ -86,12 +82,9 @@ class ShapeRecord(Record, frozen=True):
 class _LinkRecord(Record, frozen=True):
     """The fit of one link in a file of fits."""
 
-    link: str
-    """Name of the link that was fitted."""
-    shapes: str
-    """The ``shapes_key`` of the fitted shapes."""
-    token: ShapeRecord
-    """The single primitive for the link's token."""
+    link: str  # name of the link that was fitted
+    shapes: str  # the `shapes_key` of the fitted shapes
+    token: ShapeRecord  # the single primitive for the link's token
     token_iou: _Iou
     collision: Annotated[tuple[ShapeRecord, ...], Meta(min_length=1, max_length=MAX_PRIMITIVES)]
     collision_iou: _Iou
@@ -103,8 +96,7 @@ class _LinkRecord(Record, frozen=True):
 
 
 class _FileRecord(Record, frozen=True):
-    fitter: int
-    """The ``FITTER_VERSION`` that wrote the file."""
+    fitter: int  # the `FITTER_VERSION` that wrote the file
     links: list[_LinkRecord]
 
 

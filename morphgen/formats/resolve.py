@@ -42,8 +42,7 @@ _NAME_TAG = re.compile(rb"<name>\s*([^<\s]+)\s*</name>")
 class PackageFinder:
     """Finds ROS packages around the file that names them and in further folders."""
 
-    roots: tuple[Path, ...] = ()
-    """Folders that contain packages, in search order."""
+    roots: tuple[Path, ...] = ()  # folders that contain packages, in search order
     root: Path | None = None
     """A folder from which files may be read, besides the description's own folder and package."""
     skip_missing: bool = False
@@ -133,13 +132,11 @@ class FoundFile:
     """A file that a description refers to."""
 
     path: Path
-    package: str = ""
-    """Package of its URI, if it names one."""
+    package: str = ""  # package of its URI, if it names one
     place: Literal["", "beside", "installed"] = ""
     """``beside`` if the package is unknown and the file was found around the description;
     ``installed`` if the package is an installed one that the user did not name."""
-    folder: Path = Path()
-    """Folder of the package."""
+    folder: Path = Path()  # folder of the package
 
 
 def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
@@ -245,10 +242,7 @@ def package_source(file: FoundFile) -> dict[str, str]:
             if _is_in(file.folder, [_absolute(distribution.locate_file(f)) for f in folders]):
                 about = distribution.metadata.json
                 licence = licence or str(about.get("license_expression", about.get("license", "")))
-                return {
-                    "source": f"{name} {distribution.version}",
-                    "licence": licence or "unknown",
-                }
+                return {"source": f"{name} {distribution.version}", "licence": licence or "unknown"}
     return {"source": file.folder.name, "licence": licence or "unknown"}
 
 

@@ -11,14 +11,7 @@ import math
 from dataclasses import replace
 
 from morphgen.model.geometry import Geometry, Mesh, Pose, Shape, map_dimensions
-from morphgen.model.robot import (
-    DEFAULT_EFFORT,
-    DEFAULT_VELOCITY,
-    Inertial,
-    Joint,
-    Mimic,
-    Robot,
-)
+from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Inertial, Joint, Mimic, Robot
 from morphgen.model.rotation import Vec3, normalize
 
 _ROTATION_DECIMALS = 10

@@ -190,8 +190,7 @@ def _possible_alternatives(grammar: Grammar) -> dict[str, list[Alternative]]:
 
 MAX_CHECKED = 500
 """Largest number of structures whose ports ``check_grammar`` tests, for a finite grammar."""
-MAX_CHECKED_INFINITE = 40
-"""The same limit for a grammar with infinitely many structures."""
+MAX_CHECKED_INFINITE = 40  # the same limit for a grammar with infinitely many structures
 INNER_QUANTILE = 0.381966
 """Quantile of a test value that is neither a bound nor the middle; 1 - 1 / golden ratio."""
 _TESTED: tuple[Draw, ...] = (

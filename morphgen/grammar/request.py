@@ -134,8 +134,7 @@ def _with_count(production: Production, count: int) -> Production:
     return replace(production, alternatives=(replace(alternative, items=items),))
 
 
-SLOTS: tuple[PartKind, ...] = ("base", "arm", "ee")
-"""Kinds of parts that a request can choose."""
+SLOTS: tuple[PartKind, ...] = ("base", "arm", "ee")  # kinds of parts that a request can choose
 OBJECT: PartKind = "object"
 """Kind of the parts that a request names alone, without base, arm and end-effector."""
 _NAMED: tuple[PartKind, ...] = (*SLOTS, OBJECT)

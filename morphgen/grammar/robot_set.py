@@ -48,8 +48,7 @@ GRAMMAR = "grammar.grammar"
 DERIVATION = "derivation.txt"
 JOURNAL = ".journal.jsonl"
 
-Record = dict[str, Any]
-"""A line of the index."""
+Record = dict[str, Any]  # a line of the index
 SetWorker = Callable[["SetConfig", Sequence[int]], Iterator[Record]]
 """Makes the robots of the given indices, in any order."""
 

@@ -29,8 +29,7 @@ from morphgen.grammar.values import RobotProperties, clauses, holds
 from morphgen.model.findings import Finding
 from morphgen.model.robot import Robot
 
-MAX_ATTEMPTS = 500
-"""Draws for one robot before its conditions are considered unsatisfiable."""
+MAX_ATTEMPTS = 500  # draws for one robot before its conditions are considered unsatisfiable
 TOO_LARGE = f"more than {MAX_PARTS} parts"
 """Reason for rejecting a draw whose recursion exceeds the part limit."""
 UNCHANGED = "nothing changed"

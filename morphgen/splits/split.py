@@ -27,8 +27,7 @@ Side = Literal["train", "test"]
 SIDES: tuple[Side, ...] = ("train", "test")
 
 FORMAT = 1
-COMPOSED = "composed"
-"""Category of a robot that was not sampled from a grammar."""
+COMPOSED = "composed"  # category of a robot that was not sampled from a grammar
 MAX_LINKS_KEY = "max_links"
 """Key in ``provenance`` of the largest number of links, if it is not the paper's."""
 HOLD_OUT_KEY = "hold_out"
@@ -39,16 +38,11 @@ HOLD_OUT_KEY = "hold_out"
 class Member:
     """A robot of a split and its task."""
 
-    name: str
-    """Name of the robot, unique on each side of the split."""
-    category: str
-    """Grammar that the robot was sampled from, or ``composed``."""
-    derivation: str
-    """Parts and parameters of the robot, see ``morphgen.grammar.derivation``."""
-    task: str
-    """Name of the task; the tasks package knows which tasks exist."""
-    obstacles: bool
-    """The scene has obstacles."""
+    name: str  # name of the robot, unique on each side of the split
+    category: str  # grammar that the robot was sampled from, or `composed`
+    derivation: str  # parts and parameters of the robot, see `morphgen.grammar.derivation`
+    task: str  # name of the task; the tasks package knows which tasks exist
+    obstacles: bool  # the scene has obstacles
     robot_hash: str
     """Hash of the composed robot, see ``morphgen.encoding.robot_hash``; ``body`` in files."""
 
@@ -68,8 +62,7 @@ def require_side(side: str) -> None:
 class Split:
     """Train and test robots, with the history of the split."""
 
-    name: str
-    """Name, such as ``extrapolation/arms/reach``."""
+    name: str  # name, such as `extrapolation/arms/reach`
     regime: Regime
     summary: str
     train: tuple[Member, ...]
@@ -78,8 +71,7 @@ class Split:
     """Arguments and seed of the generator that chose the robots; ``made`` in files."""
     accepted: Mapping[str, str] = field(default_factory=dict)
     """Findings of the audit that the author accepts: reasons by code."""
-    reference: str = ""
-    """Source of the split, such as a table of a paper."""
+    reference: str = ""  # source of the split, such as a table of a paper
     statistics: Mapping[str, object] = field(default_factory=dict)
     """Statistics of the robots, for readers; nothing depends on them."""
     version: str = field(default_factory=lambda: version("morphgen"), compare=False)

@@ -113,12 +113,7 @@ def _accept_browsers(viewer: Viewer) -> None:
     async def connect(client: viser.ClientHandle) -> None:
         token = secrets.token_urlsafe(24)
         session = Session(
-            client,
-            viewer.files,
-            viewer.workers,
-            viewer.simulator,
-            viewer.start,
-            cache=viewer.cache,
+            client, viewer.files, viewer.workers, viewer.simulator, viewer.start, cache=viewer.cache
         )
         viewer.sessions[token] = session
 

@@ -215,10 +215,7 @@ class Session:
     def notify(self, title: str, text: str, *, error: bool = False) -> None:
         """Show a notification; it closes after six seconds unless it is an error."""
         self.client.add_notification(
-            title,
-            text,
-            auto_close_seconds=None if error else 6.0,
-            color="red" if error else None,
+            title, text, auto_close_seconds=None if error else 6.0, color="red" if error else None
         )
 
     def send_file(self, name: str, content: bytes) -> None:

@@ -40,13 +40,7 @@ from morphgen.formats.zip_files import (
     stays_inside,
 )
 from morphgen.model.geometry import MESH_SUFFIXES
-from morphgen.viewer.robot_uri import (
-    UPLOAD,
-    FileAccess,
-    UriError,
-    require_own_files,
-    shorten,
-)
+from morphgen.viewer.robot_uri import UPLOAD, FileAccess, UriError, require_own_files, shorten
 
 MAX_UPLOADS = 50  # uploads that a viewer keeps
 LIMITS = ZipLimits(max_bytes=100 * 2**20, max_files=2000, max_name=100, max_depth=20)
@@ -174,10 +168,7 @@ def _is_hidden(file: PurePosixPath) -> bool:
 
 
 def _main_description(
-    name: str,
-    formats: dict[str, str | None],
-    documents: _Documents,
-    unpacked: Collection[str],
+    name: str, formats: dict[str, str | None], documents: _Documents, unpacked: Collection[str]
 ) -> str:
     """Return the description to show.
 
@@ -271,10 +262,7 @@ def _require_inner_uri(path: str, uri: str) -> None:
 
 
 def _write_upload(
-    stored: dict[str, bytes],
-    urdfs: dict[str, etree._Element],
-    mjcf: str | None,
-    files: FileAccess,
+    stored: dict[str, bytes], urdfs: dict[str, etree._Element], mjcf: str | None, files: FileAccess
 ) -> str:
     """Write an upload into a new folder, or nothing; return the folder's name."""
     if sum(1 for _ in files.uploads.iterdir()) >= MAX_UPLOADS:

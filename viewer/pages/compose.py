@@ -154,9 +154,7 @@ class ComposePage:
             + (f"<br>changed: {escape(change)}" if change else ""),
         )
         self._command.content = markup.framed(
-            markup.command(shown.command),
-            "<h3>Derivation</h3>",
-            markup.code(str(shown.derivation)),
+            markup.command(shown.command), "<h3>Derivation</h3>", markup.code(str(shown.derivation))
         )
         session.address = replace(session.address, subjects=(shown.subject,))
         session.title = f"compose {shown.robot.name}"

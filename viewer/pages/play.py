@@ -35,12 +35,7 @@ from morphgen.viewer.rollout import (
     list_checkpoints,
     simulation,
 )
-from morphgen.viewer.scene.rollout import (
-    RolloutScene,
-    add_episode,
-    episode_page,
-    show_step,
-)
+from morphgen.viewer.scene.rollout import RolloutScene, add_episode, episode_page, show_step
 from morphgen.viewer.scene.stage import look_at
 
 SIMULATOR_NAMES = (DEFAULT_SIMULATOR, *sorted({*SIMULATORS} - {DEFAULT_SIMULATOR, "warp"}))

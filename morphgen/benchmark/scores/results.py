@@ -286,12 +286,7 @@ class References:
 
 
 def collect_references(
-    paths: Sequence[Path],
-    split: Split,
-    protocol: EvalProtocol,
-    library: Library,
-    *,
-    jobs: int = 1,
+    paths: Sequence[Path], split: Split, protocol: EvalProtocol, library: Library, *, jobs: int = 1
 ) -> References:
     """Read the reference scores of a new release from submissions and studies, and check them."""
     submissions: dict[str, Submission] = {}

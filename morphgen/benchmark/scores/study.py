@@ -202,9 +202,7 @@ def require_cells(cells: Sequence[Cell]) -> None:
 
 
 def do_cell(
-    cell: Cell,
-    execution: ExecutionConfig,
-    show: Callable[[Subrun], ShowMetrics] | None = None,
+    cell: Cell, execution: ExecutionConfig, show: Callable[[Subrun], ShowMetrics] | None = None
 ) -> None:
     """Train and evaluate a cell, or what remains of it. No other process may work on it.
 
@@ -282,8 +280,7 @@ def _submission(cell: Cell, name: str, scores: Sequence[Score]) -> Submission:
 POLL = 2.0  # time between two checks of cells that another process works on [s]
 
 
-Outcome = tuple[Cell, str]
-"""A cell and its error message, which is empty after success."""
+Outcome = tuple[Cell, str]  # a cell and its error message, which is empty after success
 
 
 def run_cells(
@@ -341,9 +338,7 @@ def _on_ray(cell: Cell, execution: ExecutionConfig) -> str:
 
 
 def _do_locked(
-    cell: Cell,
-    execution: ExecutionConfig,
-    show: Callable[[Subrun], ShowMetrics] | None,
+    cell: Cell, execution: ExecutionConfig, show: Callable[[Subrun], ShowMetrics] | None
 ) -> str | None:
     """Train and evaluate a cell and return its error; None if another process works on it."""
     try:

@@ -43,17 +43,14 @@ _LINE = re.compile(r",? line \d+(, column \d+)?")
 class MjcfDocument:
     """An MJCF document that names no file."""
 
-    path: Path
-    """The file that it was read from."""
-    name: str
-    """Name of the model; that of the file if the document has none."""
+    path: Path  # the file that it was read from
+    name: str  # name of the model; that of the file if the document has none
     text: str
     """The document with includes inserted, without the sections that a robot does not need."""
     meshes: Mapping[str, Path]
     """File of every mesh asset by name; assets with vertices in the document have none until
     ``inline_meshes`` adds it."""
-    includes: tuple[Path, ...] = ()
-    """Files whose content is inserted."""
+    includes: tuple[Path, ...] = ()  # files whose content is inserted
     findings: tuple[Finding, ...] = ()
     """Repairs without which the document could not be parsed, and what is left out."""
 

@@ -25,8 +25,7 @@ MAX_SHAPES = 10_000  # largest number of visual and collision shapes that is rea
 MAX_ERRORS = 50  # number of errors after which the check stops
 
 _SCHEMA = read_schema("urdf")
-CHILDREN = _SCHEMA.children
-"""Children that are read or checked, by element."""
+CHILDREN = _SCHEMA.children  # children that are read or checked, by element
 _READ_ATTRIBUTES = {tag: [each.name for each in rules] for tag, rules in _SCHEMA.attributes.items()}
 _READ_CHILDREN = {
     tag: [name for name, mark in children.items() if mark != "?"]

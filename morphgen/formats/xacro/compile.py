@@ -84,12 +84,10 @@ class Traced:
 class CompiledXacro:
     """A document with expressions over parameters."""
 
-    texts: tuple[str, ...]
-    """Texts before, between and after the expressions."""
+    texts: tuple[str, ...]  # texts before, between and after the expressions
     expressions: tuple[Expression, ...]
     """Distinct expressions; most documents use one several times."""
-    order: tuple[int, ...]
-    """Index of the expression after each text except the last."""
+    order: tuple[int, ...]  # index of the expression after each text except the last
 
     def fill(self, values: Mapping[str, str]) -> bytes:
         """Return the document for values of the parameters, given as xacro arguments."""

@@ -221,11 +221,7 @@ def _symbols(engine: Engine) -> dict[str, object]:
         **dict.fromkeys(("message", "warning", "error", "print_location"), _discard),
     }
     functions = {name: Function(name, call) for name, call in calls.items()}
-    return {
-        **NAMES,
-        **{name: functions[name] for name in files},
-        "xacro": Namespace(functions),
-    }
+    return {**NAMES, **{name: functions[name] for name in files}, "xacro": Namespace(functions)}
 
 
 def _discard(*words: object, **_: object) -> str:
