@@ -227,16 +227,22 @@ class TaskGroups:
         }
 
     def tool_targets(self, object_pose: torch.Tensor, least: int = 0) -> ToolTargets:
-        """Return the points, padded to a least number, and orientations that tasks want."""
+        """Return the points, padded to a least number, and orientations that tasks want.
+
+        A task with fewer points than others repeats its last one, where the tool is to stay. Were
+        the others missing, robots that only reach would learn that the first point is the goal,
+        and would stop there at push, behind the block.
+        """
         groups = self._groups.values()
         points = [group.envs.target_points(self._rows_of(group, object_pose)) for group in groups]
         count = max(least, *(each.shape[1] for each in points))
-        order = torch.arange(count, device=object_pose.device)
         targets = []
         for group, values in zip(groups, points, strict=True):
-            padding = (0, 0, 0, len(order) - values.shape[1])
-            exists = (order < values.shape[1]).expand(len(group.rows), -1)
-            target = {"points": torch.nn.functional.pad(values, padding), "exists": exists}
+            k, own = len(group.rows), values.shape[1]
+            last = values[:, -1:] if own else values.new_zeros(k, 1, 3)
+            repeated = torch.cat([values, last.expand(k, count - own, 3)], dim=1)
+            exists = torch.full((k, count), own > 0, device=object_pose.device)
+            target = {"points": repeated, "exists": exists}
             if (rotations := group.envs.target_rotations()) is not None:
                 wanted = torch.ones_like(group.rows, dtype=torch.bool)
                 target |= {"rotations": rotations, "has_rotation": wanted}

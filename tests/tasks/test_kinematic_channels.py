@@ -191,6 +191,21 @@ def test_push_observes_the_block_from_the_nearest_point_of_the_robot(tmp_path):
     assert (distance > 0).all()
 
 
+def test_a_task_with_fewer_target_points_than_another_repeats_its_last(specs, tmp_path):
+    robot = morphgen.compose("arm3", geometry="primitive")
+    config = replace(PushConfig(), num_goals=5)
+    push = draw_spec(robot, config, obstacles=False, seed=0, cache=tmp_path)
+    batch = batch_from_specs([specs[0], push], 4, sim="mujoco", observe=ALL)
+    batch.reset()
+    goals = batch.groups.tool_targets(batch.simulation.object_pose)
+    reach = batch.task_mask("reach")
+    goal = batch.field("goal")[reach, None, :3]
+    assert goals.exists.all()
+    torch.testing.assert_close(goals.points[reach], goal.expand(-1, 3, 3))
+    beyond = goals.points[~reach, 2, 1] - goals.points[~reach, 1, 1]
+    assert (beyond > 0).all()
+
+
 def test_channels_are_asked_for_by_name():
     config = observation_config(["lag", "points", "no_state"], obstacles=3)
     assert (config.lag, config.points, config.state, config.obstacles) == (
