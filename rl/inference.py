@@ -25,6 +25,7 @@ from morphgen.rl.observation_layout import (
     pad_links,
     require_layout,
     truncate_links,
+    with_fields,
 )
 from morphgen.rl.policies import make_networks, rows_needed
 from morphgen.rl.runs.checkpoint import Interface, policy_interface, read_checkpoint
@@ -113,16 +114,6 @@ class Policy:
             layout = structs.replace(layout, links=self.layout.links)
         require_layout(self.layout, layout, "the checkpoint")
 
-    def _with_fields(self, observation: Observation) -> Observation:
-        """Add fields of other tasks of the policy, which no robot of this batch has."""
-        added = dict(observation)
-        links = observation["links"]
-        for name, size, mask in self.layout.fields:
-            if name not in added and mask not in observation:
-                added[name] = torch.zeros(len(links), size, device=links.device)
-                added.setdefault(mask, torch.zeros_like(links[:, 0]))
-        return added
-
     @torch.no_grad()
     def act(self, observation: Observation) -> torch.Tensor:
         """Return actions for observations, shape (n, L), on the device of the observations.
@@ -133,7 +124,7 @@ class Policy:
         Raises:
             TaskError: If the observations have another layout than those of the training.
         """
-        observation = self._with_fields(observation)
+        observation = with_fields(observation, self.layout.fields)
         self.require(observation)
         needed = truncate_links(observation, rows_needed(self.config, observation))
         head = self._actor.distribution({k: v.to(self._device) for k, v in needed.items()})

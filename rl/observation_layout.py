@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -202,6 +203,26 @@ def require_layout(stored: Layout, observed: Layout, what: str) -> None:
             f"{what} is for other observations: {wrong}; these depend on the task, its goals and "
             "obstacles, and the observation channels"
         )
+
+
+Fields = Sequence[tuple[str, int, str]]
+"""Name, size and mask of fields of tasks, as in ``Layout.fields``."""
+
+
+def fields_of(tasks: Collection[str]) -> Fields:
+    """Return the fields that tasks declare."""
+    declared = dict.fromkeys(field for task in sorted(tasks) for field in TASKS[task].fields)
+    return tuple((field.name, field.size, field.mask) for field in declared)
+
+
+def with_fields(observation: Observation, fields: Fields) -> Observation:
+    """Return an observation with fields of tasks that no robot of its batch has: zeros, masked."""
+    added, links = dict(observation), observation["links"]
+    for name, size, mask in fields:
+        if name not in added and mask not in observation:
+            added[name] = torch.zeros(len(links), size, device=links.device)
+            added.setdefault(mask, torch.zeros_like(links[:, 0]))
+    return added
 
 
 def last_link(observation: Observation) -> int:

@@ -25,7 +25,14 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.distributed import ALONE, ProcessGroup, UpdateMetrics
-from morphgen.rl.observation_layout import joint_entropy, layout_of, pad_links, truncate_links
+from morphgen.rl.observation_layout import (
+    fields_of,
+    joint_entropy,
+    layout_of,
+    pad_links,
+    truncate_links,
+    with_fields,
+)
 from morphgen.rl.policies import entries_unneeded, make_networks, rows_needed
 from morphgen.tasks.batch import StepGraph, TaskBatch, can_record
 from morphgen.tasks.observation import Observation
@@ -205,10 +212,12 @@ class Learner:
         self.update, self.num_updates = 0, config.num_updates(batch.num_envs * processes.size)
         self.minibatch_size = config.minibatch_size(batch.num_envs)
         self.use(batch)
-        observation = self._current_observation()
+        tasks = {*tasks, *(spec.task for spec in batch.specs)}
+        self._fields = fields_of(tasks)
+        observation = with_fields(self._current_observation(), self._fields)
         self.layout = layout_of(observation)
         self.num_link_rows = max(rows_needed(policy, observation), least_links)
-        self._unneeded = entries_unneeded(policy, {*tasks, *(spec.task for spec in batch.specs)})
+        self._unneeded = entries_unneeded(policy, tasks)
 
         network_seed, *streams = np.random.SeedSequence(seed).generate_state(4).tolist()
         if processes.rank:  # the same networks, but other actions and minibatches
@@ -310,6 +319,7 @@ class Learner:
 
     def _needed(self, observation: Observation) -> Observation:
         """Return the entries and the rows of links that the networks need."""
+        observation = with_fields(observation, self._fields)
         entries = {name: observation[name] for name in observation if name not in self._unneeded}
         return truncate_links(entries, self.num_link_rows)
 

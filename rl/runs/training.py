@@ -32,7 +32,13 @@ from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import PPOConfig, differences, policy_from
 from morphgen.rl.demonstrations.cloning import Cloner, DemonstrationBatches
 from morphgen.rl.distributed import ProcessGroup, UpdateMetrics, process_group
-from morphgen.rl.observation_layout import Layout, last_link, layout_of, require_layout
+from morphgen.rl.observation_layout import (
+    Layout,
+    last_link,
+    layout_of,
+    require_layout,
+    with_fields,
+)
 from morphgen.rl.ppo import FINETUNING_ACTOR_LR_SCALE, Learner
 from morphgen.rl.runs.checkpoint import (
     CHECKPOINT,
@@ -140,7 +146,8 @@ def load_networks(learner: Learner, state: Mapping[str, Any]) -> None:
 def use_batch(learner: Learner, batch: TaskBatch) -> None:
     """Continue with other environments; all of them begin new episodes."""
     observation = batch.observe()
-    require_layout(learner.layout, layout_of(observation), "the learner")
+    layout = layout_of(with_fields(observation, learner.layout.fields))
+    require_layout(learner.layout, layout, "the learner")
     if (batch.num_envs, batch.action_kind) != (learner.batch.num_envs, learner.policy.kind):
         raise TaskError(
             f"{batch.num_envs} environments with {batch.action_kind} actions; expected "

@@ -33,6 +33,19 @@ def test_a_clone_repeats_the_planner(demos, tmp_path):
     assert last["explained_variance"] > 0.5
 
 
+def test_a_policy_for_several_tasks_sees_the_fields_of_each(demos, tmp_path):
+    """The steps of a chunk, and the first of all, may be of one task."""
+    other = morphgen.record("prims", tasks=["drawer"], episodes=2, out=tmp_path / "drawer")
+    both = [demos.folder, other.folder]
+    run = morphgen.clone(both, epochs=0.2, minibatch=64, out=tmp_path / "run")
+    assert "object_base" in str(read_checkpoint(run.folder)[1]["layout"])
+    scores = [
+        morphgen.evaluate(run.folder, robots=f"prims task={task}", episodes=2).scores
+        for task in ("reach", "drawer")
+    ]
+    assert all(len(score["deterministic"]) == 1 for score in scores)
+
+
 def test_the_same_seed_gives_the_same_weights(demos, tmp_path):
     runs = [
         morphgen.clone(demos.folder, epochs=1, minibatch=64, seed=3, out=tmp_path / name)

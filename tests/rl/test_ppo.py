@@ -520,13 +520,13 @@ def test_final_observations_are_the_same_on_every_device(monkeypatch):
     values = torch.rand(7, 5, 2, generator=generator)
 
     def gathered():
-        seen = [{"goal": value, "sum": value.sum(dim=1)} for value in values]
+        seen = [{"links": value, "sum": value.sum(dim=1)} for value in values]
         return student._truncated_rows(list(map(student._rows_to_keep, seen, masks)))
 
     on_host = gathered()
     monkeypatch.setattr(base, "HOST_DEVICES", ())
     elsewhere = gathered()
-    assert torch.equal(on_host["goal"], values[masks])
+    assert torch.equal(on_host["links"], values[masks])
     assert all(torch.equal(on_host[name], elsewhere[name]) for name in on_host)
 
 
