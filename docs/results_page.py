@@ -1,4 +1,4 @@
-"""Write the tables of docs/results.md and results/tables.md, and their figures, from the scores.
+"""Write the tables of docs/results.md and of three pages of results/, and figures, from the scores.
 
     python docs/results_page.py
 
@@ -32,6 +32,8 @@ from morphgen.splits.split import SIDES
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs/results.md"
 TABLES = ROOT / "results/tables.md"
+FILES = ROOT / "results/README.md"
+OLDER = ROOT / "results/studies.md"
 IMAGES = ROOT / "docs/images/results"
 STUDIES = ("reach-30m", "reach-30m-4epochs", "reach-100m", "push-30m")
 TASKS = ("reach", "reach-obstacles", "push", "push-obstacles")
@@ -60,6 +62,25 @@ AGENTS = {
     f"se{PAPER_AGENT}": "`se`, the paper's observations",
     f"se{PAPER_AGENT}@test": "`se` on the test robot",
 }
+SHIPPED = {
+    "reach": "reach",
+    "obstacles": "`--obstacles`",
+    "pose": "`--goal pose`",
+    "pose-obstacles": "`--goal pose --obstacles`",
+    "push": "`--task push`",
+    "push-seed1": "`--task push`, another seed",
+    **{task: f"`--task {task}`" for task in OBJECTS},
+    **{
+        f"elsewhere-{folder}-{task}": f"{task}, robots from elsewhere, {robots}"
+        for task in ("reach", "push")
+        for folder, robots in (
+            ("mjcf", "bare"),
+            ("mjcf-stick", "with a stick"),
+            ("hand", "written by hand"),
+        )
+    },
+}
+"""Files of results/zero-shot, and what they measure."""
 BASELINES = ("scripted", "ik", "jacobian", "random", "zero")
 COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#9ae6b4", "#f6e05e")
 CURVE_COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#c53030", "#805ad5")
@@ -67,6 +88,7 @@ sys.path.append(str(ROOT / "benchmarks"))
 CURVE = runpy.run_path(str(ROOT / "benchmarks/robot_curve.py"))
 CURVE_OPTIONS = CURVE["arguments"](["--report", "--out", str(ROOT / "results/robot-curve.json")])
 TRANSFER = runpy.run_path(str(ROOT / "benchmarks/similarity_transfer.py"))
+SHIPPED_ARMS = runpy.run_path(str(ROOT / "benchmarks/zero_shot_arms.py"))
 
 
 @cache
@@ -175,6 +197,89 @@ def ee_task_table() -> str:
         lines.append([*_run_cells(agent, steps, seeds), rates[0], score, *rates[1:]])
     headers = ["agent", "transitions", "seeds", "MT, push", "MT, reach", "success", "ZS, push"]
     return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
+
+
+def seeds_table() -> str:
+    """Return the splits of each study on which an agent has one seed, or no run as others have."""
+    lines = []
+    for study in (*STUDIES, "ee-task-30m", "objects-30m", "reach-24m"):
+        seeds: dict[str, dict[str, set[int]]] = {}
+        for row in rows_of(study):
+            if row.method in AGENTS and row.transitions:
+                seeds.setdefault(row.method, {}).setdefault(row.split, set()).update(row.seeds)
+        splits = list(dict.fromkeys(split for found in seeds.values() for split in found))
+        for agent in sorted(seeds, key=list(AGENTS).index):
+            one = [split for split, own in seeds[agent].items() if len(own) == 1]
+            none = [split for split in splits if split not in seeds[agent]]
+            if one or none:
+                lines.append([f"`{study}`", AGENTS[agent], ", ".join(one), ", ".join(none)])
+    headers = ["study", "agent", "one seed", "no run"]
+    return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
+
+
+def shipped_rows(file: str) -> dict[str, dict[str, Any]]:
+    """Return the rows of a file of results/zero-shot by robot and, the policy first, controller."""
+    data = json.loads((ROOT / f"results/zero-shot/{file}.json").read_text("utf-8"))
+    return {robot: {row["controller"]: row for row in rows} for robot, rows in data.items()}
+
+
+def shipped_table() -> str:
+    """Return the mean success over robots of each shipped policy, and the lowest of a robot."""
+    lines = []
+    for file, label in SHIPPED.items():
+        robots = [*shipped_rows(file).values()]
+        policy, *_ = robots[0]
+        trials = [rows[policy]["episodes"] for rows in robots]
+        line = [label, str(len(robots)), str(max(trials))]
+        for name in (policy, "path", "jacobian", "ik", "scripted", "random"):
+            rates = [rows[name]["success"]["value"] for rows in robots if name in rows]
+            text = f"{mean(rates):.1%}; {min(rates):.0%}" if rates else ""
+            if name == policy:
+                ends = success_interval(rates, trials).ends(".0%")
+                text = f"{mean(rates):.1%} ({ends}); {min(rates):.0%}"
+            line.append(text)
+        lines.append(line)
+    names = ("path", "jacobian", "ik", "scripted", "random")
+    headers = ["mean; lowest of a robot", "robots", "episodes", "policy"]
+    headers += [f"`{name}`" for name in names]
+    return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
+
+
+def shipped_objects_table() -> str:
+    """Return success of the shipped policies of drawer, door and dial on each arm."""
+    found = [shipped_rows(task) for task in OBJECTS]
+    lines = []
+    for arm in found[0]:
+        rates = [next(iter(rows[arm].values()))["success"] for rows in found]
+        lines.append([arm, *(Interval(**rate).as_percent() for rate in rates)])
+    headers = ["arm", *OBJECTS]
+    return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
+
+
+def elsewhere_table() -> str:
+    """Return success of the shipped policies and the best baselines on robots from elsewhere."""
+    lines = []
+    for file, label in SHIPPED.items():
+        if not (file.startswith("elsewhere") and file.endswith("reach")):
+            continue
+        push = shipped_rows(file.replace("reach", "push"))
+        for robot, rows in sorted(shipped_rows(file).items()):
+            policy, *_ = rows.values()
+            found = [policy, rows["jacobian"], rows["ik"]]
+            if robot in push:
+                policy, *_ = push[robot].values()
+                found += [policy, push[robot]["scripted"]]
+            cells = [f"{row['success']['value']:.0%}" for row in found]
+            (name,) = re.findall(r"^(?:arm=rs_)?(\w+)", robot)
+            lines.append([f"{name}, {label.split(', ')[-1]}", *cells, *[""] * (5 - len(cells))])
+    headers = ["robot", "reach: policy", "`jacobian`", "`ik`", "push: policy", "`scripted`"]
+    return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
+
+
+def tolerance_table() -> str:
+    """Return the table of ``benchmarks/zero_shot_arms.py --tolerances``."""
+    stored = json.loads((ROOT / "results/zero-shot/tolerances.json").read_text("utf-8"))
+    return str(SHIPPED_ARMS["tolerance_table"](stored["robots"]))
 
 
 def _run_cells(agent: str, steps: int, seeds: int, note: str = "") -> list[str]:
@@ -378,7 +483,17 @@ def save(figure: Figure, name: str) -> Path:
 
 def tables() -> dict[Path, dict[str, str]]:
     """Return the tables of each page by their names."""
-    return {PAGE: {"summary": summary_table()}, TABLES: _all_tables()}
+    return {
+        PAGE: {"summary": summary_table()},
+        TABLES: _all_tables(),
+        FILES: {"seeds": seeds_table()},
+        OLDER: {
+            "shipped": shipped_table(),
+            "shipped-objects": shipped_objects_table(),
+            "elsewhere": elsewhere_table(),
+            "tolerances": tolerance_table(),
+        },
+    }
 
 
 def _all_tables() -> dict[str, str]:
