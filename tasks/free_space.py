@@ -6,6 +6,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import combinations, product
 
 import numpy as np
@@ -312,10 +313,11 @@ class FreeSpace:
         blocks = np.asarray(blocks, dtype=np.float64)
         self._require_blocks(blocks, n)
         rotations = blocks[:, 3:]
-        if n and (rotations == rotations[0]).all():  # as along a path: the block stands still
-            rotations = rotations[:1]
-        turns = [to_rpy(normalize((w, x, y, z))) for w, x, y, z in rotations.tolist()]
-        rpy = np.broadcast_to(np.array(turns).reshape(-1, 3), (n, 3))
+        # As along a path, most rotations are that of the row before.
+        is_new = np.ones(n, dtype=np.bool_)
+        is_new[1:] = (rotations[1:] != rotations[:-1]).any(axis=1)
+        turns = [_rpy(*rotation) for rotation in rotations[is_new].tolist()]
+        rpy = np.array(turns).reshape(-1, 3)[is_new.cumsum() - 1]
         return np.concatenate([blocks[:, :3], rpy[:, ::-1]], axis=1)
 
     def _require_blocks(self, blocks: Array, n: int) -> None:
@@ -327,6 +329,12 @@ class FreeSpace:
             )
         if not np.isfinite(blocks).all():
             raise ValueError("a pose of the block is not finite")
+
+
+@lru_cache(maxsize=256)  # a plan tests a block at a thousand places with one rotation
+def _rpy(w: float, x: float, y: float, z: float) -> Vec3:
+    """Return roll, pitch and yaw of a quaternion [rad]."""
+    return to_rpy(normalize((w, x, y, z)))
 
 
 def outside_limits(robot: Robot, q: Array) -> Iterator[tuple[int, str]]:

@@ -160,11 +160,12 @@ class PathPlanner:
         cost: PathCost | None = None,
         block: Array | None = None,
         tree: Tree | None = None,
+        limit: float = np.inf,
     ) -> Path | None:
         """Return the cheapest free path, straight to a goal or by way of its via; None without one.
 
         Start (dof,), goals (n, dof) and vias (n, dof) are configurations; the block has a pose (7,)
-        if the scene has one.
+        if the scene has one. Paths that cost as much as the limit are not tried.
         """
         free_fraction = partial(self.space.free_fraction, block=block, resolution=self._resolution)
         cost = cost or PathCost(np.zeros(len(goals)), np.full(len(goals), np.inf))
@@ -175,7 +176,9 @@ class PathPlanner:
                 path = Path((*along, *last), i)
                 candidates.append((float(cost.of(self.length(start, path), i)), len(last), path))
         free: list[tuple[float, Path]] = []
-        for _, new, path in sorted(candidates, key=lambda candidate: candidate[0]):
+        for value, new, path in sorted(candidates, key=lambda candidate: candidate[0]):
+            if value >= limit:
+                break
             points = [start, *path.waypoints]
             # From the goal backwards: there the room is least. The tree's own lines are free.
             if any(free_fraction(a, b) < 1 for a, b in pairwise(points[: -new - 2 : -1])):

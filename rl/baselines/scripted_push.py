@@ -8,9 +8,9 @@ the block until both collide.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
-from typing import Self
+from typing import Self, TypeAlias
 
 import numpy as np
 import torch
@@ -47,6 +47,7 @@ _NEAREST, _QUICKEST = 24, 36
 _MIN_HEIGHT, _MAX_HEIGHT = 0.2, 0.45
 """Heights of the tool: pushed above its middle, a block with a friction of 1 tips over."""
 _CANDIDATES = 24  # pre-contacts, the cheapest first, to which straight paths are tried
+_SIMULATED_AT_ONCE = 48  # candidates that are simulated at once, those of several pushes together
 _SIMULATED, _OVERHANG_EVERY = 12, 3
 """Number of points at which a push is tested; the overhang is tested at every third of them."""
 _TOLERANCE = 0.02  # distance from a point that counts as reached
@@ -65,7 +66,7 @@ _RETREAT_DIRECTIONS = (
 )
 _UNFINISHED_COST, _NARROW_COST = 400.0, 120.0
 """Cost of a push that does not move the block, and of a contact of width zero."""
-_OVERHANG_COST, _MAX_OVERHANG = 3000.0, 0.1
+_OVERHANG_COST, MAX_OVERHANG = 3000.0, 0.1
 """Cost per edge of overhang, and the overhang at which the cost is capped."""
 _COMPLIANCE_COST = 3000.0  # cost per metre of the tool's deflection by the block's friction
 _ACCELERATION_STEPS = 25  # time until arm and block have the speed of the push [control steps]
@@ -87,20 +88,48 @@ class Plan:
 
 
 @dataclass(frozen=True, eq=False)
-class _Candidates:
-    """Pre-contacts that can begin a push, a row each."""
+class Push:
+    """A push to plan."""
 
-    q: Array  # configurations, shape (n, dof)
-    position: Array  # positions of the tool, shape (n, 3) [m]
-    rotation: Array  # rotations of the tool, shape (n, 3, 3)
-    offset: Array  # `Plan.offset`, shape (n,)
-    gap: Array  # `Plan.gap`, shape (n,)
-    cost: Array  # cost of the push [control steps], shape (n,)
-    steps: Array  # duration of the push [control steps], shape (n,)
+    q: Array  # configuration of the robot, shape (dof,)
+    block: Array  # pose of the block, shape (7,)
+    attempt: int = 0  # number of earlier plans in the episode
+    steps_left: float = np.inf  # control steps until the time limit
+
+
+@dataclass(frozen=True, eq=False)
+class PreContact:
+    """Configurations behind the block that touch it if they move along y; one per row."""
+
+    row: NDArray[np.intp]  # indices of the configurations among the tested ones, shape (n,)
+    q: Array  # configurations, shape (n, dof) [rad or m]
+    block: Array  # poses of the block, shape (n, 7)
+    gap: Array  # motion along y until the robot touches the block, shape (n,) [m]
+    offset: Array
+    """Offset of the block along x for which the contact is on its middle, shape (n,) [m]."""
+    width: Array  # fraction of `OFFSETS` at which the block is touched, shape (n,)
 
     def take(self, rows: NDArray[np.intp]) -> Self:
         """Return some of the rows."""
         return type(self)(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates(PreContact):
+    """Pre-contacts from which a push may begin."""
+
+    position: Array  # positions of the tool, shape (n, 3) [m]
+    rotation: Array  # rotations of the tool, shape (n, 3, 3)
+    compliance: Array  # deflection of the tool along y by the block's friction, shape (n,) [m]
+    cost: Array
+    """Cost of the push, shape (n,) [control steps]; inf if it fails, and a lower bound until it was
+    simulated."""
+    is_simulated: NDArray[np.bool_]  # whether the push was simulated, shape (n,)
+    via: Array  # configurations with the tool above, of those that were simulated, shape (n, dof)
+
+
+Found: TypeAlias = tuple[float, Path, _Candidates]
+"""Cost of a path and the push behind it, the path, and the candidates that it is to one of."""
 
 
 class ToolKinematics:
@@ -166,77 +195,145 @@ class PushPlanner:
         """Return whether configurations (n, dof) are free of collisions without the block, (n,)."""
         return self._space.free(q)
 
-    def plan(
-        self, q: Array, block: Array, attempt: int = 0, steps_left: float = np.inf
-    ) -> Plan | None:
-        """Return the cheapest plan to push a block (7,) from a configuration (dof,).
+    def plan(self, pushes: Sequence[Push]) -> list[Plan | None]:
+        """Return the cheapest plan of each push.
 
         It is None if there is no plan, or too little time to push the block across the line.
         """
-        if steps_left < (self._line - block[1]) / SPEED:
-            return None
-        start = self._retreat(q, block)
-        plans = [self._plan_straight(start, self._candidates_near(q, block), block, steps_left)]
-        if plans[0] is None or plans[0][0] > _EXPENSIVE:
-            # Self-collisions may divide free space: look for pre-contacts near configurations that
-            # can be reached.
-            no_goals = np.zeros((0, len(q)))
-            _, tree = self._planner.plan_rrt(
-                start, no_goals, block=block, attempt=attempt, iterations=_TREE_ITERATIONS
-            )
-            candidates = self._candidates_on(tree, block)
-            plans.append(self._plan_straight(start, candidates, block, steps_left, tree))
-        valid_plans = [plan for plan in plans if plan is not None]
-        if not valid_plans:
-            return None
-        _, path, candidates = min(valid_plans, key=lambda plan: plan[0])
-        i = path.goal
-        return Plan(
-            path=path.waypoints if start is q else (start, *path.waypoints),
-            rotation=torch.from_numpy(candidates.rotation[i]).float(),
-            height=float(candidates.position[i, 2]),
-            offset=float(candidates.offset[i]),
-            gap=float(candidates.gap[i]),
-        )
+        plans: list[Plan | None] = [None] * len(pushes)
+        in_time = [
+            i
+            for i, push in enumerate(pushes)
+            if push.steps_left >= (self._line - push.block[1]) / SPEED
+        ]
+        starts = [self._retreat(pushes[i].q, pushes[i].block) for i in in_time]
+        straight = self._plan_straight([pushes[i] for i in in_time], starts) if in_time else []
+        for i, start, option in zip(in_time, starts, straight, strict=True):
+            options = [option]
+            if option is None or option[0] > _EXPENSIVE:
+                options.append(self._plan_along_tree(pushes[i], start))
+            valid = [each for each in options if each is not None]
+            if valid:
+                _, path, candidates = min(valid, key=lambda each: each[0])
+                if start is not pushes[i].q:
+                    path = Path((start, *path.waypoints), path.goal)
+                plans[i] = self._chosen(path, candidates)
+        return plans
 
-    def _plan_straight(
+    def _plan_straight(self, pushes: Sequence[Push], starts: Sequence[Array]) -> list[Found | None]:
+        """Return the cheapest straight path of each push, if any.
+
+        Pushes are simulated in the order of the lower bounds of their costs, until no other can be
+        cheaper than the path.
+        """
+        results: list[Found | None] = [None] * len(pushes)
+        candidates, push_of = self._candidates_near(pushes)
+        pending = [*range(len(pushes))]
+        while pending:
+            to_simulate = []
+            at_once = -(-_SIMULATED_AT_ONCE // len(pending))
+            for i in [*pending]:
+                rows = np.flatnonzero((push_of == i) & np.isfinite(candidates.cost))
+                cost = self._path_cost(pushes[i], candidates.take(rows))
+                values = cost.of(self._planner.steps(starts[i], candidates.q[rows]))
+                order = np.argsort(values, kind="stable")[:_CANDIDATES]
+                is_simulated = candidates.is_simulated[rows[order]]
+                others = order[~is_simulated]
+                results[i] = self._cheapest(
+                    pushes[i],
+                    starts[i],
+                    candidates.take(rows[order[is_simulated]]),
+                    limit=values[others[0]] if len(others) else np.inf,
+                )
+                if results[i] is None and len(others):
+                    to_simulate.append(rows[others[:at_once]])
+                else:
+                    pending.remove(i)
+            if to_simulate:
+                self._simulate(candidates, np.concatenate(to_simulate))
+        return results
+
+    def _plan_along_tree(self, push: Push, start: Array) -> Found | None:
+        """Return the cheapest path along a tree of reachable configurations, if any.
+
+        Self-collisions may divide free space: the pre-contacts are near the tree.
+        """
+        no_goals = np.zeros((0, len(start)))
+        _, tree = self._planner.plan_rrt(
+            start, no_goals, block=push.block, attempt=push.attempt, iterations=_TREE_ITERATIONS
+        )
+        nodes = np.array(tree.nodes)
+        tools, _ = self._tool.poses(nodes)
+        starts, goals = self._behind(nodes, tools, push.block, np.zeros(0, dtype=np.intp))
+        q, _ = self._solve(starts, goals, np.tile(push.block, (len(starts), 1)))
+        candidates = self._candidates(q, np.tile(push.block, (len(q), 1)))
+        self._simulate(candidates, np.arange(len(candidates.q)))
+        candidates = candidates.take(np.flatnonzero(np.isfinite(candidates.cost)))
+        return self._cheapest(push, start, candidates, tree=tree)
+
+    def _path_cost(self, push: Push, candidates: _Candidates) -> PathCost:
+        """Return the cost of paths to candidates."""
+        steps = (candidates.gap + self._line - push.block[1]) / SPEED + _ACCELERATION_STEPS
+        return PathCost(candidates.cost, push.steps_left - steps)
+
+    def _cheapest(
         self,
+        push: Push,
         start: Array,
         candidates: _Candidates,
-        block: Array,
-        steps_left: float,
+        *,
         tree: Tree | None = None,
-    ) -> tuple[float, Path, _Candidates] | None:
-        """Return cost, path and candidates of the cheapest free path; None without one."""
-        cost = PathCost(candidates.cost, steps_left - candidates.steps)
-        if tree is None:
-            order = np.argsort(cost.of(self._planner.steps(start, candidates.q)), kind="stable")
-            candidates = candidates.take(order[:_CANDIDATES])
-            cost = PathCost(candidates.cost, steps_left - candidates.steps)
+        limit: float = np.inf,
+    ) -> Found | None:
+        """Return the cheapest free path to candidates, if any costs less than the limit."""
+        cost = self._path_cost(push, candidates)
         path = self._planner.plan_straight(
-            start, candidates.q, vias=self._lift(candidates), cost=cost, block=block, tree=tree
+            start,
+            candidates.q,
+            vias=candidates.via,
+            cost=cost,
+            block=push.block,
+            tree=tree,
+            limit=limit,
         )
         if path is None:
             return None
         value = float(cost.of(self._planner.length(start, path), path.goal))
         return value, path, candidates
 
-    def _candidates_near(self, q: Array, block: Array) -> _Candidates:
-        """Return candidates from inverse kinematics that starts at random free configurations."""
-        bank = unwrap_joints(self._robot, q, self._bank)
-        quickest = np.argsort(self._planner.steps(q, bank), kind="stable")[:_QUICKEST]
-        starts, goals = self._behind(bank, self._bank_tools, block, quickest)
-        starts[::2, self._idle] = q[self._idle]
-        starts[1::2, self._idle] = np.array(self._robot.home)[self._idle]
-        free = self._solve(starts, goals, block)
-        return self._evaluate(unwrap_joints(self._robot, q, free), block)
+    def _chosen(self, path: Path, candidates: _Candidates) -> Plan:
+        """Return the plan of a path to one of the candidates."""
+        i = path.goal
+        x, _, height = candidates.position[i].tolist()
+        return Plan(
+            path=path.waypoints,
+            rotation=torch.from_numpy(candidates.rotation[i]).float(),
+            height=height,
+            offset=float(x - candidates.block[i, 0] - candidates.offset[i]),
+            gap=float(candidates.gap[i]),
+        )
 
-    def _candidates_on(self, tree: Tree, block: Array) -> _Candidates:
-        """Return candidates from inverse kinematics that starts at the nodes of a tree."""
-        nodes = np.array(tree.nodes)
-        tools, _ = self._tool.poses(nodes)
-        starts, goals = self._behind(nodes, tools, block, np.zeros(0, dtype=np.intp))
-        return self._evaluate(self._solve(starts, goals, block), block)
+    def _candidates_near(self, pushes: Sequence[Push]) -> tuple[_Candidates, NDArray[np.intp]]:
+        """Return candidates from inverse kinematics that starts at random free configurations.
+
+        The second result is the index of each one's push, shape (n,).
+        """
+        parts = []
+        for push in pushes:
+            bank = unwrap_joints(self._robot, push.q, self._bank)
+            quickest = np.argsort(self._planner.steps(push.q, bank), kind="stable")[:_QUICKEST]
+            starts, goals = self._behind(bank, self._bank_tools, push.block, quickest)
+            starts[::2, self._idle] = push.q[self._idle]
+            starts[1::2, self._idle] = np.array(self._robot.home)[self._idle]
+            parts.append((starts, goals))
+        starts, goals = (np.concatenate(each) for each in zip(*parts, strict=True))
+        push_of = np.repeat(np.arange(len(pushes)), [len(each) for each, _ in parts])
+        blocks = np.array([push.block for push in pushes])
+        q, rows = self._solve(starts, goals, blocks[push_of])
+        push_of = push_of[rows]
+        now = np.array([push.q for push in pushes])[push_of]
+        candidates = self._candidates(unwrap_joints(self._robot, now, q), blocks[push_of])
+        return candidates, push_of[candidates.row]
 
     def _behind(
         self, q: Array, tools: Array, block: Array, also: NDArray[np.intp]
@@ -258,63 +355,75 @@ class PushPlanner:
             starts.append(q[near])
         return np.concatenate(starts), np.concatenate(goals)
 
-    def _solve(self, starts: Array, goals: Array, block: Array) -> Array:
-        """Return the collision-free solutions (k, dof) for goals of the tool (n, 3), k <= n."""
+    def _solve(self, starts: Array, goals: Array, blocks: Array) -> tuple[Array, NDArray[np.intp]]:
+        """Return the collision-free solutions (k, dof) for goals of the tool (n, 3), k <= n.
+
+        The second result is their rows among the goals, shape (k,).
+        """
         q, error = solve_position_ik(self._robot, starts, goals)
-        solved = (np.abs(error[:, :2]) < _TOLERANCE * self._edge).all(axis=1)
-        q = q[solved & (np.abs(error[:, 2]) < self._edge / 2)]
-        return q[self._space.free(q, np.tile(block, (len(q), 1)))]
+        good = (np.abs(error[:, :2]) < _TOLERANCE * self._edge).all(axis=1)
+        good &= np.abs(error[:, 2]) < self._edge / 2
+        good[good] = self._space.free(q[good], blocks[good])
+        return q[good], np.flatnonzero(good)
 
-    def _evaluate(self, q: Array, block: Array) -> _Candidates:
-        """Return those configurations behind the block (n, dof) that can begin a push."""
-        contacts = find_contacts(self._space, q, block, self._edge)
+    def _candidates(self, q: Array, blocks: Array) -> _Candidates:
+        """Return those configurations behind their blocks (n, dof) that touch them along y."""
+        contacts = find_contacts(self._space, q, blocks, self._edge)
         position, rotation = self._tool.poses(contacts.q)
-        offset = position[:, 0] - block[0] - contacts.offset
-        finished, over = self._simulate(contacts, position, rotation, offset, block)
-        cost = _UNFINISHED_COST * (1 - finished) + _NARROW_COST * (1 - contacts.width)
-        cost += _OVERHANG_COST * np.minimum(over, _MAX_OVERHANG) + contacts.gap / SPEED
-        cost += _COMPLIANCE_COST * self._compliance(contacts.q)
-        steps = (contacts.gap + self._line - block[1]) / SPEED + _ACCELERATION_STEPS
-        candidates = _Candidates(contacts.q, position, rotation, offset, contacts.gap, cost, steps)
-        return candidates.take(np.flatnonzero(finished > 0))
+        _, J = frame_jacobian(self._robot, contacts.q)
+        compliance = self._friction * (J[:, 1] ** 2 / self._stiffness).sum(axis=1)
+        candidates = _Candidates(
+            **vars(contacts),
+            position=position,
+            rotation=rotation,
+            compliance=compliance,
+            cost=np.zeros(len(position)),
+            is_simulated=np.zeros(len(position), dtype=np.bool_),
+            via=contacts.q.copy(),
+        )
+        candidates.cost[:] = _push_cost(candidates, np.ones(len(position)), np.zeros(len(position)))
+        return candidates
 
-    def _simulate(
-        self, contacts: PreContact, position: Array, rotation: Array, offset: Array, block: Array
-    ) -> tuple[Array, Array]:
-        """Simulate pushes without dynamics; return their successful fractions and overhangs, (n,).
+    def _simulate(self, candidates: _Candidates, chosen: NDArray[np.intp]) -> None:
+        """Simulate the pushes of some candidates, without dynamics, for their costs.
 
         At each point the arm must be free of collisions, and stay in contact: it must touch a block
         slightly nearer than the pushed one, and not touch one slightly farther.
         """
-        edge, q = self._edge, contacts.q
-        length = contacts.gap + self._line - block[1] + 0.1 * edge
-        good, fraction = np.ones(len(q), dtype=np.bool_), np.zeros(len(q))
-        over = contacts.overhang.copy()
+        each, edge = candidates.take(chosen), self._edge
+        q, block, gap = each.q, each.block, each.gap
+        length = gap + self._line - block[:, 1] + 0.1 * edge
+        good, finished = np.ones(len(q), dtype=np.bool_), np.zeros(len(q))
+        centred = block.copy()
+        centred[:, 0] += each.offset
+        over = overhang(self._space, q, centred, edge)
+        goal = each.position.copy()
+        goal[:, 0] = block[:, 0] + (each.position[:, 0] - block[:, 0] - each.offset)
         for i in range(1, _SIMULATED + 1):
             ahead = length * i / _SIMULATED
-            goal = position.copy()
-            goal[:, 0] = block[0] + offset
-            goal[:, 1] += ahead
-            q = self._tool.move_towards(q, goal, rotation, 4)
+            goal[:, 1] = each.position[:, 1] + ahead
+            q = self._tool.move_towards(q, goal, each.rotation, 4)
             error = np.abs(self._tool.poses(q)[0][:, :2] - goal[:, :2]).max(axis=1)
-            good &= (error < _TOLERANCE * edge + 0.002) & self._space.free(q)
-            moved = np.maximum(ahead - contacts.gap, 0)[:, None]
-            shifts = moved + np.array([-_NEARER, _FARTHER]) * edge
-            nearer, farther = touches(self._space, q, block, np.zeros(1), shifts).T
-            good &= (nearer & ~farther) | (ahead < contacts.gap)
-            fraction[good] = i / _SIMULATED
+            good &= error < _TOLERANCE * edge + 0.002
+            good[good] = self._space.free(q[good])
+            moved = np.maximum(ahead - gap, 0)
+            touching = np.flatnonzero(good & (ahead >= gap))
+            shifts = moved[touching, None] + np.array([-_NEARER, _FARTHER]) * edge
+            nearer, farther = touches(
+                self._space, q[touching], block[touching], np.zeros(1), shifts
+            ).T
+            good[touching] = nearer & ~farther
+            finished[good] = i / _SIMULATED
             if i % _OVERHANG_EVERY == 0:
-                rows = np.flatnonzero(good)
-                blocks = np.tile(block, (len(rows), 1))
-                blocks[:, 1] += moved[rows, 0] + _FARTHER * edge
-                over[rows] = np.maximum(over[rows], overhang(self._space, q[rows], blocks, edge))
-        begun = fraction * length > contacts.gap + 0.1 * edge
-        return np.where(begun, fraction, 0.0), over
-
-    def _compliance(self, q: Array) -> Array:
-        """Return the deflection of the tools along y by the block's friction, shape (n,) [m]."""
-        _, J = frame_jacobian(self._robot, q)
-        return np.asarray(self._friction * (J[:, 1] ** 2 / self._stiffness).sum(axis=1))
+                rows = np.flatnonzero(good & (over < MAX_OVERHANG))
+                ahead_of = block[rows]
+                ahead_of[:, 1] += moved[rows] + _FARTHER * edge
+                over[rows] = np.maximum(over[rows], overhang(self._space, q[rows], ahead_of, edge))
+        begun = finished * length > gap + 0.1 * edge
+        cost = _push_cost(each, finished, over)
+        candidates.cost[chosen] = np.where(begun, cost, np.inf)
+        candidates.is_simulated[chosen] = True
+        candidates.via[chosen] = self._lift(each)
 
     def _lift(self, candidates: _Candidates) -> Array:
         """Return configurations (n, dof) with the tool above the candidates, if possible."""
@@ -351,45 +460,53 @@ raised one also slightly above it."""
 PRESSED = 0.1  # distance that the block is pressed against the robot when the width is tested
 
 
-@dataclass(frozen=True, eq=False)
-class PreContact:
-    """Configurations behind the block that touch it if they move along y; one per row."""
-
-    q: Array  # configurations, shape (n, dof) [rad or m]
-    gap: Array  # motion along y until the robot touches the block, shape (n,) [m]
-    offset: Array
-    """Offset of the block along x for which the contact is on its middle, shape (n,) [m]."""
-    width: Array  # fraction of `OFFSETS` at which the block is touched, shape (n,)
-    overhang: Array
-    """Overhang over the block as the function ``overhang`` returns it, shape (n,) [edges]."""
+def _push_cost(candidates: _Candidates, finished: Array, over: Array) -> Array:
+    """Return the cost of pushes (n,) by the fraction that they finish and their overhang, (n,)."""
+    cost = _UNFINISHED_COST * (1 - finished) + _NARROW_COST * (1 - candidates.width)
+    cost += _OVERHANG_COST * over + candidates.gap / SPEED
+    return np.asarray(cost + _COMPLIANCE_COST * candidates.compliance)
 
 
-def find_contacts(space: FreeSpace, q: Array, block: Array, edge: float) -> PreContact:
-    """Return those configurations (n, dof), free of the block (7,), that touch it along y."""
-    gap = _gaps(space, q, np.tile(block, (len(q), 1)), edge, 0.0)
-    touching = np.isfinite(gap)
-    q, gap = q[touching], gap[touching]
+def find_contacts(space: FreeSpace, q: Array, blocks: Array, edge: float) -> PreContact:
+    """Return those configurations (n, dof), free of blocks (n, 7), that touch these along y."""
+    first, rows = np.full(len(q), len(SHIFTS)), np.arange(len(q))
+    for k, shift in enumerate(SHIFTS * edge):
+        hit = touches(space, q[rows], blocks[rows], np.zeros(1), np.array([-shift]))[:, 0]
+        first[rows[hit]], rows = k, rows[~hit]
+    row = np.flatnonzero(first < len(SHIFTS))
+    q, blocks = q[row], blocks[row]
+    gap = _gaps(space, q, blocks, edge, first[row])
     pressed = (gap + PRESSED * edge)[:, None]
-    touched = touches(space, q, block, OFFSETS * edge, -pressed)
+    touched = touches(space, q, blocks, OFFSETS * edge, -pressed)
     count = np.maximum(touched.sum(axis=1), 1)
     offset = (touched * OFFSETS).sum(axis=1) / count * edge
-    blocks = np.tile(block, (len(q), 1))
-    blocks[:, 0] += offset
-    return PreContact(q, gap, offset, count / len(OFFSETS), overhang(space, q, blocks, edge))
+    return PreContact(row, q, blocks, gap, offset, count / len(OFFSETS))
 
 
 def overhang(space: FreeSpace, q: Array, blocks: Array, edge: float) -> Array:
     """Return the overhang of a robot over the block that it touches if it moves along y.
 
     It is the lead along y with which the robot touches the block (n, 7) above its middle before it
-    touches it below, shape (n,), 0 to 1 edges. With overhang, a push presses the block to the
-    ground or tips it over. The configurations (n, dof) are free of the block.
+    touches it below, shape (n,), 0 to `MAX_OVERHANG` edges. With overhang, a push presses the block
+    to the ground or tips it over. The configurations (n, dof) are free of the block.
     """
-    below, above = (
-        np.minimum(_gaps(space, q, blocks, edge, dz * edge), SHIFTS[-1] * edge)
-        for dz in (BELOW, ABOVE)
-    )
-    return np.asarray(np.clip((below - above) / edge, 0.0, 1.0))
+    below, above = np.full((2, len(q)), len(SHIFTS))
+    rows = np.arange(len(q))
+    for k, shift in enumerate(SHIFTS * edge):
+        for touched, dz in ((above, ABOVE), (below, BELOW)):
+            new = rows[touched[rows] > k]
+            hit = touches(space, q[new], blocks[new], np.zeros(1), np.array([-shift]), dz * edge)
+            touched[new[hit[:, 0]]] = k
+        # Below first: no overhang. Above first by more than a shift: the largest overhang.
+        rows = rows[(below[rows] > k) & (above[rows] >= k)]
+    lead = np.where(below - above > 1, MAX_OVERHANG, 0.0)
+    close = np.flatnonzero((below - above == 0) | (below - above == 1))
+    ends = [
+        _gaps(space, q[close], blocks[close], edge, touched[close], dz * edge)
+        for touched, dz in ((below, BELOW), (above, ABOVE))
+    ]
+    lead[close] = np.clip((ends[0] - ends[1]) / edge, 0.0, MAX_OVERHANG)
+    return lead
 
 
 def touches(
@@ -408,21 +525,25 @@ def touches(
     return ~free.reshape(n, k)
 
 
-def _gaps(space: FreeSpace, q: Array, blocks: Array, edge: float, dz: float) -> Array:
-    """Return how far blocks (n, 7), shifted by ``dz``, are along y from the robot; inf if never."""
-    shifts, zero = SHIFTS * edge, np.zeros(1)
-    touched = touches(space, q, blocks, zero, -shifts, dz)
-    first = touched.argmax(axis=1)
-    gaps = np.where(touched.any(axis=1), shifts[first], np.inf)
-    rows = np.isfinite(gaps)
-    q, blocks, high = q[rows], blocks[rows], gaps[rows]
-    low = np.where(first[rows] > 0, shifts[first[rows] - 1], 0.0)
+def _gaps(
+    space: FreeSpace,
+    q: Array,
+    blocks: Array,
+    edge: float,
+    first: NDArray[np.intp],
+    dz: float = 0.0,
+) -> Array:
+    """Return how far blocks (n, 7), shifted by ``dz``, are along y from the robot, (n,) [m].
+
+    ``first`` is the first of ``SHIFTS`` that touches, (n,); without any, the gap is the largest.
+    """
+    shifts = np.array([0.0, *SHIFTS, SHIFTS[-1]]) * edge
+    low, high = shifts[first], shifts[first + 1]
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        hit = touches(space, q, blocks, zero, -middle[:, None], dz)[:, 0]
+        hit = touches(space, q, blocks, np.zeros(1), -middle[:, None], dz)[:, 0]
         low, high = np.where(hit, low, middle), np.where(hit, middle, high)
-    gaps[rows] = high
-    return gaps
+    return high
 
 
 MAX_PLANS = 8  # maximum number of plans per episode
@@ -460,7 +581,7 @@ class ScriptedPush:
         """Set up; plans depend on the seed, the robot, its starts and the state of the episode."""
         self._seed = seed
         self._specs: Sequence[EnvSpec] = ()
-        self._planners: dict[tuple[int, int | None], PushPlanner] = {}
+        self._planners: dict[tuple[int, int], PushPlanner] = {}
         self._task: TaskBatch | None = None
 
     def act(self, task: TaskBatch) -> torch.Tensor:
@@ -476,8 +597,8 @@ class ScriptedPush:
         new = is_push & (task.episode_step == 0)
         self._num_plans[new] = 0
         failed = self._advance(task, block, tool) | (is_push & ~self._active)
-        for env in torch.nonzero(new | (failed & (self._num_plans < MAX_PLANS)))[:, 0].tolist():
-            self._plan(task, env, block[env])
+        for key, envs in _envs_by_planner(task, new | (failed & (self._num_plans < MAX_PLANS))):
+            self._plan(task, key, envs, block)
         self._height += torch.where(self._blocked(task), RISE, 0.0)
         pushed = self._push(task, block, tool)
         targets = torch.where(self.pushing[:, None], pushed, self._follower.waypoint)
@@ -507,28 +628,38 @@ class ScriptedPush:
         )
         self._rotation = torch.zeros(n, 3, 3, device=device)
 
-    def _plan(self, task: TaskBatch, env: int, block: torch.Tensor) -> None:
-        """Make a plan in one environment; block is the pose of its block, shape (7,)."""
-        robot, _ = key = _robot_and_layout(task, env)
+    def _plan(
+        self, task: TaskBatch, key: tuple[int, int], envs: Sequence[int], block: torch.Tensor
+    ) -> None:
+        """Make plans in environments of a robot and layout; block has poses of blocks, (n, 7)."""
+        robot, _ = key
         if key not in self._planners:
             rng = np.random.default_rng([self._seed, robot])
+            scene = task.layouts.scene(envs[0])
             self._planners[key] = PushPlanner(
-                task.specs[robot], task.layouts.scene(env), task.robot_tables, robot, rng
+                task.specs[robot], scene, task.robot_tables, robot, rng
             )
-        q = task.targets[env, : task.specs[robot].robot.dof].double().cpu().numpy()
-        steps_left = int(task.max_episode_steps[env] - task.episode_step[env])
-        plan = self._planners[key].plan(
-            q, block.double().cpu().numpy(), int(self._num_plans[env]), steps_left
-        )
-        self._num_plans[env] += 1
-        self._active[env], self.pushing[env] = plan is not None, False
-        if plan is None:
-            return
-        self._follower.follow(env, plan.path)
-        self._rotation[env], self._height[env] = plan.rotation, plan.height
-        self._offset[env], self._gap[env] = plan.offset, plan.gap
-        self._begun[env], self._best[env], self._lead[env] = block[0], block[1], LEAD
-        self._settling[env], self._still[env], self._stuck[env] = 0, 0, 0
+        dof = task.specs[robot].robot.dof
+        pushes = [
+            Push(
+                q=task.targets[env, :dof].double().cpu().numpy(),
+                block=block[env].double().cpu().numpy(),
+                attempt=int(self._num_plans[env]),
+                steps_left=int(task.max_episode_steps[env] - task.episode_step[env]),
+            )
+            for env in envs
+        ]
+        self._num_plans[envs] += 1
+        self._active[envs] = self.pushing[envs] = False
+        for env, plan in zip(envs, self._planners[key].plan(pushes), strict=True):
+            if plan is None:
+                continue
+            self._follower.follow(env, plan.path)
+            self._active[env] = True
+            self._rotation[env], self._height[env] = plan.rotation, plan.height
+            self._offset[env], self._gap[env] = plan.offset, plan.gap
+            self._begun[env], self._best[env], self._lead[env] = *block[env, :2], LEAD
+            self._settling[env], self._still[env], self._stuck[env] = 0, 0, 0
 
     def _advance(self, task: TaskBatch, block: torch.Tensor, tool: torch.Tensor) -> torch.Tensor:
         """Switch to the next waypoint or to the push; return where pushes failed, (n,), bool."""
@@ -550,12 +681,9 @@ class ScriptedPush:
     def _blocked(self, task: TaskBatch) -> torch.Tensor:
         """Return where a pushing arm's targets collide with anything but the block, (n,), bool."""
         blocked = torch.zeros_like(self._active)
-        envs_of = defaultdict[tuple[int, int | None], list[int]](list)
-        for env in torch.nonzero(self._active & self.pushing)[:, 0].tolist():
-            envs_of[_robot_and_layout(task, env)].append(env)
-        for (robot, layout), envs in envs_of.items():
-            q = task.targets[envs, : task.specs[robot].robot.dof].double().cpu().numpy()
-            free = self._planners[robot, layout].free(q)
+        for key, envs in _envs_by_planner(task, self._active & self.pushing):
+            q = task.targets[envs, : task.specs[key[0]].robot.dof].double().cpu().numpy()
+            free = self._planners[key].free(q)
             blocked[envs] = ~torch.from_numpy(free).to(blocked.device)
         return blocked
 
@@ -591,6 +719,12 @@ class ScriptedPush:
         return targets
 
 
-def _robot_and_layout(task: TaskBatch, env: int) -> tuple[int, int]:
-    """Return the indices of an environment's robot and of the layout of its obstacles."""
-    return int(task.env_robot_index[env]), int(task.layouts.current[env])
+def _envs_by_planner(
+    task: TaskBatch, mask: torch.Tensor
+) -> Iterable[tuple[tuple[int, int], list[int]]]:
+    """Return the environments of a mask (n,) by the indices of their robot and layout."""
+    envs_of = defaultdict[tuple[int, int], list[int]](list)
+    for env in torch.nonzero(mask)[:, 0].tolist():
+        key = int(task.env_robot_index[env]), int(task.layouts.current[env])
+        envs_of[key].append(env)
+    return envs_of.items()

@@ -28,9 +28,11 @@ from morphgen.rl.baselines.path_planner import (
 )
 from morphgen.rl.baselines.scripted_articulated import Scripted
 from morphgen.rl.baselines.scripted_push import (
+    MAX_OVERHANG,
     MAX_PLANS,
     RISE,
     SPEED,
+    Push,
     PushPlanner,
     ScriptedPush,
     ToolKinematics,
@@ -53,6 +55,7 @@ from morphgen.tasks.sim.base import Block, Scene
 STEP = np.array([0.02, 0.02])
 FAR_AWAY = np.array([0.0, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0])
 NO_DEADLINE = np.array([np.inf, np.inf])
+X = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 NO_GOALS = np.zeros((0, 2))
 
 
@@ -399,7 +402,7 @@ def test_a_plan_has_a_free_path_behind_the_block(tmp_path):
     planner = push_planner_of(setting)
     space, tool = FreeSpace(setting.scene), ToolKinematics(build_robot_tables([setting.robot]), 0)
     for q, block in zip(setting.goals.q[:3], setting.goals.blocks, strict=False):
-        plan = planner.plan(q, block)
+        (plan,) = planner.plan([Push(q, block)])
         points = [q, *plan.path]
         for a, b in pairwise(points):
             between = a + np.linspace(0, 1, 200)[:, None] * (b - a)
@@ -409,8 +412,10 @@ def test_a_plan_has_a_free_path_behind_the_block(tmp_path):
         assert position[2] == pytest.approx(plan.height)
         assert plan.rotation.numpy() == pytest.approx(rotation, abs=1e-6)
     across = (setting.goals.line - block[1]) / SPEED
-    assert planner.plan(q, block, steps_left=across + 1) is not None
-    assert planner.plan(q, block, steps_left=across - 1) is None
+    hasty, late = (Push(q, block, steps_left=across + each) for each in (-1, 1))
+    plans = planner.plan([hasty, late, Push(q, block)])
+    assert [plan is None for plan in plans] == [True, False, False]
+    assert np.array_equal(plans[2].path, planner.plan([Push(q, block)])[0].path)
 
 
 def test_a_plan_avoids_overhang(tmp_path, monkeypatch):
@@ -418,7 +423,7 @@ def test_a_plan_avoids_overhang(tmp_path, monkeypatch):
     setting = draw_spec(robot(PLANE), PUSH, obstacles=False, seed=0, cache=tmp_path)
     planner = push_planner_of(setting)
     q, block = setting.goals.q[0], setting.goals.blocks[0]
-    first = planner.plan(q, block).path[-1]
+    first = planner.plan([Push(q, block)])[0].path[-1]
 
     def near(configurations):
         return np.abs(configurations - first).max(axis=-1) < 1.0
@@ -426,11 +431,11 @@ def test_a_plan_avoids_overhang(tmp_path, monkeypatch):
     def said(space, configurations, blocks, edge):
         assert blocks.shape == (len(configurations), 7)
         assert (blocks[:, 1] >= block[1]).all()
-        return near(configurations).astype(float)
+        return MAX_OVERHANG * near(configurations)
 
     monkeypatch.setattr(scripted_push, "overhang", said)
     assert near(first)
-    assert not near(planner.plan(q, block).path[-1])
+    assert not near(planner.plan([Push(q, block)])[0].path[-1])
 
 
 def test_the_planner_rejects_other_tasks(tmp_path):
@@ -448,8 +453,9 @@ def test_obstructed_arms_push_below_the_middle(tmp_path):
     planner = push_planner_of(setting)
     space, edge = FreeSpace(setting.scene), setting.goals.block.size[0]
     for q, block in zip(setting.goals.q[3:5], setting.goals.blocks[3:5], strict=True):
-        end = planner.plan(q, block).path[-1]
-        assert find_contacts(space, end[None], block, edge).overhang[0] < 0.05
+        end = planner.plan([Push(q, block)])[0].path[-1]
+        centred = block[None] + find_contacts(space, end[None], block[None], edge).offset[0] * X
+        assert overhang(space, end[None], centred, edge)[0] < 0.05
 
 
 def test_the_tool_can_turn_around():
@@ -463,20 +469,19 @@ def test_the_tool_can_turn_around():
 
 
 def test_contacts_are_found_where_the_robot_touches_the_block():
-    block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
+    blocks = np.array([[0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0]] * 3)
     q = np.array([[0.0, -0.5], [0.1, -0.5], [1.5, -0.5]])
-
-    def found(height):
-        scene = Scene(ball(height), object=Block((0.4, 0.4, 0.4)), ground=None)
-        return find_contacts(FreeSpace(scene), q, block, 0.4)
-
-    low = found(0.2)
+    spaces = [
+        FreeSpace(Scene(ball(height), object=Block((0.4, 0.4, 0.4)), ground=None))
+        for height in (0.2, 0.35)
+    ]
+    low = find_contacts(spaces[0], q, blocks, 0.4)
     assert low.q.tolist() == q[:2].tolist()
     assert low.gap == pytest.approx(0.2, abs=0.002)
     assert low.offset == pytest.approx([0.0, 0.1], abs=0.05)
     assert low.width == pytest.approx(0.5, abs=0.12)
-    assert low.overhang.max() == 0
-    assert found(0.35).overhang.min() > 0.5
+    assert overhang(spaces[0], q[:2], blocks[:2], 0.4).max() == 0
+    assert overhang(spaces[1], q[:2], blocks[:2], 0.4).min() == MAX_OVERHANG
 
 
 def test_the_contact_of_a_plate_is_as_wide_as_the_plate():
@@ -484,7 +489,7 @@ def test_the_contact_of_a_plate_is_as_wide_as_the_plate():
     wide = ball(0.2).with_links([plate])
     scene = Scene(wide, object=Block((0.4, 0.4, 0.4)), ground=None)
     block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
-    found = find_contacts(FreeSpace(scene), np.array([[0.0, -0.5]]), block, 0.4)
+    found = find_contacts(FreeSpace(scene), np.array([[0.0, -0.5]]), block[None], 0.4)
     assert found.width[0] == 1
 
 
@@ -495,15 +500,12 @@ def test_the_overhang_of_a_brim_is_its_lead(ahead, over):
     brim = Shape(Box((0.2, 0.1, 0.02)), Pose((0.0, ahead, 0.3)))
     wide = ball(0.1).with_links([Link("ball", collisions=(foot, brim))])
     scene = Scene(wide, object=Block((0.4, 0.4, 0.4)), ground=None)
-    block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
-    found = find_contacts(FreeSpace(scene), np.array([[0.0, -0.5]]), block, 0.4)
+    q = np.array([[0.0, -0.5]] * 2)
+    blocks = np.array([[0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0], [3.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0]])
+    found = find_contacts(FreeSpace(scene), q, blocks, 0.4)
+    assert found.row.tolist() == [0]
     assert found.gap[0] == pytest.approx(0.25 - max(ahead, 0), abs=0.002)
-    assert found.overhang[0] == pytest.approx(over, abs=0.0035)
-
-    beyond = np.array([[0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0], [3.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0]])
-    each = overhang(FreeSpace(scene), np.array([[0.0, -0.5]] * 2), beyond, 0.4)
-    assert each[0] == found.overhang[0]
-    assert each[1] == 0
+    assert overhang(FreeSpace(scene), q, blocks, 0.4) == pytest.approx([over, 0], abs=0.0035)
 
 
 def batch(words, n, cache, task="push", **options):
@@ -574,9 +576,9 @@ def test_a_block_that_slips_away_is_replanned(tmp_path, monkeypatch):
     made = []
     plan = PushPlanner.plan
 
-    def counted(self, *args):
-        made.append(args)
-        return plan(self, *args)
+    def counted(self, pushes):
+        made.extend(pushes)
+        return plan(self, pushes)
 
     monkeypatch.setattr(PushPlanner, "plan", counted)
     task, controller = batch([PLANE], 1, tmp_path, sim="mujoco"), ScriptedPush(0)
@@ -592,8 +594,8 @@ def test_a_block_that_slips_away_is_replanned(tmp_path, monkeypatch):
             break
     task.close()
     assert 2 <= len(made) <= MAX_PLANS
-    assert not np.allclose(made[0][1], made[1][1])
-    left = [args[3] for args in made]
+    assert not np.allclose(made[0].block, made[1].block)
+    left = [push.steps_left for push in made]
     assert left[0] == PUSH.max_episode_steps
     assert left == sorted(left, reverse=True)
     assert left[1] <= PUSH.max_episode_steps - 59
