@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from morphgen.model.kinematics import unwrap_joints
 from morphgen.rl.baselines.path_planner import (
@@ -28,6 +30,7 @@ from morphgen.rl.baselines.scripted_push import (
     SETTLE_STEPS,
     SPEED,
     ScriptedPush,
+    envs_by_planner,
 )
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.articulated.envs import ArticulatedEnvs
@@ -70,6 +73,17 @@ seen to find one."""
 
 
 @dataclass(frozen=True, eq=False)
+class Motion:
+    """A motion of the object to plan."""
+
+    q: Array  # configuration of the robot, shape (dof,)
+    position: float  # of the object's joint [rad or m]
+    goal: float  # of the object's joint [rad or m]
+    attempt: int  # number of earlier plans in the episode
+    steps_left: float  # control steps until the time limit
+
+
+@dataclass(frozen=True, eq=False)
 class Plan:
     """A path to the first configuration of a track, and the track."""
 
@@ -104,20 +118,25 @@ class MotionPlanner:
             self._space, step, int(rng.integers(2**63)), resolution=_RESOLUTION
         )
 
-    def plan(
-        self, q: Array, position: float, goal: float, attempt: int, steps_left: float
-    ) -> Plan | None:
-        """Return the cheapest plan from a configuration (dof,) and a position of the joint."""
-        joints = self._thing.placed_joint
-        pose = joints.poses(np.array([position]))[0]
-        tracks, moves, step = self._tracks(q, position, goal, attempt)
-        if not len(tracks):
-            return None
-        wanted = abs(goal - position) * self._thing.lever + _SURPLUS * self._edge
+    def plan(self, motions: Sequence[Motion]) -> list[Plan | None]:
+        """Return the cheapest plan of each motion, if any."""
+        every, moves, motion_of = self._tracks(motions)
+        plans = []
+        for i, motion in enumerate(motions):
+            rows = np.flatnonzero(motion_of == i)
+            plans.append(self._plan(motion, every[rows], moves[rows]) if len(rows) else None)
+        return plans
+
+    def _plan(self, motion: Motion, tracks: Array, moves: Array) -> Plan | None:
+        """Return the cheapest plan along one of the tracks (n, TRACK, dof), if any."""
+        q, to_go = motion.q, self._to_go(motion)
+        step = (to_go + _BEYOND * self._edge) / (TRACK - 1)
+        pose = self._thing.placed_joint.poses(np.array([motion.position]))[0]
+        wanted = to_go + _SURPLUS * self._edge
         parts = np.minimum(np.nanmax(moves, axis=1) / wanted, 1.0)
         steps = np.maximum(self._planner.steps(tracks[:, :-1], tracks[:, 1:]), step / SPEED)
         length = np.nansum(np.where(moves[:, :-1] < wanted, steps, 0.0), axis=1)
-        cost = PathCost(length + _UNFINISHED_COST * (1 - parts), steps_left - length)
+        cost = PathCost(length + _UNFINISHED_COST * (1 - parts), motion.steps_left - length)
         order = np.argsort(cost.of(self._planner.steps(q, tracks[:, 0])), kind="stable")
         order = order[:_CANDIDATES]
         ends, chosen = tracks[order, 0], PathCost(cost.goal_cost[order], cost.deadline[order])
@@ -125,7 +144,7 @@ class MotionPlanner:
         path = self._planner.plan_straight(q, ends, cost=chosen, block=pose)
         if path is None:
             path, tree = self._planner.plan_rrt(
-                q, ends, block=pose, attempt=attempt, iterations=_TREE_ITERATIONS
+                q, ends, block=pose, attempt=motion.attempt, iterations=_TREE_ITERATIONS
             )
             path = path or self._planner.plan_straight(q, ends, cost=chosen, block=pose, tree=tree)
         if path is None:
@@ -136,41 +155,56 @@ class MotionPlanner:
         track[last + 1 :], moves[best, last + 1 :] = track[last], moves[best, last]
         return Plan(path.waypoints, track, moves[best], step, last * step)
 
-    def _tracks(
-        self, q: Array, position: float, goal: float, attempt: int
-    ) -> tuple[Array, Array, float]:
-        """Return tracks (n, TRACK, dof), the motions that they make (n, TRACK), and their step.
+    def _to_go(self, motion: Motion) -> float:
+        """Return the distance of the contact point from its goal, along its path [m]."""
+        return abs(motion.goal - motion.position) * self._thing.lever
+
+    def _tracks(self, motions: Sequence[Motion]) -> tuple[Array, Array, NDArray[np.intp]]:
+        """Return tracks (n, TRACK, dof), how far they move the object (n, TRACK), and whose.
 
         Both are NaN from where a track is not sound. Each attempt starts from other configurations.
+        The last result is the index of each track's motion, shape (n,).
         """
-        lever, edge, finder = self._thing.lever, self._edge, self._finder
-        sign = 1.0 if goal > position else -1.0
-        to_go = abs(goal - position) * lever
-        farthest = to_go + _BEYOND * edge
-        ends = np.array([position]), np.array([position + sign * farthest / lever])
-        step = farthest / (TRACK - 1)
-        bank = unwrap_joints(self._robot, q, finder.bank)
-        quickest = np.argsort(self._planner.steps(q, bank), kind="stable")
-        quickest = quickest[attempt * _QUICKEST :][:_QUICKEST]
-        found = []
+        edge, finder = self._edge, self._finder
+        position, to_go = (
+            np.array([each(motion) for motion in motions])
+            for each in (attrgetter("position"), self._to_go)
+        )
+        sign = np.array([1.0 if motion.goal > motion.position else -1.0 for motion in motions])
+        ends = position, position + sign * (to_go + _BEYOND * edge) / self._thing.lever
+        quickest = []
+        for motion in motions:
+            bank = unwrap_joints(self._robot, motion.q, finder.bank)
+            order = np.argsort(self._planner.steps(motion.q, bank), kind="stable")
+            quickest.append(order[motion.attempt * _QUICKEST :][:_QUICKEST])
+        starts, goals, owners = [], [], []
         for distance in BEHIND:
-            motions = finder.motions(*ends, distance, TRACK)
-            behind = finder.behind(motions[0], np.array([sign]), distance * edge)
-            nearest = finder.nearest(behind[:, 0])[0, attempt * _NEAREST :][:_NEAREST]
-            rows = np.concatenate([nearest, quickest])
-            repeated = [each.repeat(len(rows), axis=0) for each in (behind, *motions)]
-            found.append(unwrap_joints(self._robot, q, finder.follow(rows, *repeated)))
-        tracks = np.concatenate(found)
-        tracks = tracks[np.isfinite(tracks[:, 0, 0])]
-        moves = self._moves(tracks, position, sign, step)
-        good = np.nanmax(moves, axis=1) >= _LEAST_PART * to_go
-        return tracks[good], moves[good], step
+            poses = finder.motions(*ends, distance, TRACK)
+            behind = finder.behind(poses[0], sign, distance * edge)
+            nearest = finder.nearest(behind[:, 0])
+            for i, motion in enumerate(motions):
+                begin = motion.attempt * _NEAREST
+                rows = np.concatenate([nearest[i, begin : begin + _NEAREST], quickest[i]])
+                starts.append(rows)
+                owners.append(np.full(len(rows), i))
+            counts = [len(rows) for rows in starts[-len(motions) :]]
+            goals.append([each.repeat(counts, axis=0) for each in (behind, *poses)])
+        joined = (np.concatenate(each) for each in zip(*goals, strict=True))
+        tracks, owner = finder.follow(np.concatenate(starts), *joined), np.concatenate(owners)
+        is_begun = np.isfinite(tracks[:, 0, 0])
+        tracks, owner = tracks[is_begun], owner[is_begun]
+        now = np.array([motion.q for motion in motions])[owner]
+        tracks = unwrap_joints(self._robot, now[:, None], tracks)
+        moves = self._moves(tracks, position[owner], sign[owner])
+        good = np.nanmax(moves, axis=1) >= _LEAST_PART * to_go[owner]
+        return tracks[good], moves[good], owner[good]
 
-    def _moves(self, tracks: Array, position: float, sign: float, step: float) -> Array:
+    def _moves(self, tracks: Array, position: Array, sign: Array) -> Array:
         """Return how far robots on tracks (n, TRACK, dof) move the object, (n, TRACK) [m].
 
-        It moves on where they touch it, as if it stopped at once. It is lower than it is, as where
-        they graze its top they slip over it. NaN is from where it cannot get out of their way.
+        It moves on from its positions (n,) where they touch it, as if it stopped at once. It is
+        lower than it is, as where they graze its top they slip over it. NaN is from where it cannot
+        get out of their way.
         """
         moves = np.full(tracks.shape[:2], np.nan)
         moves[:, 0], edge = 0.0, self._edge
@@ -181,8 +215,8 @@ class MotionPlanner:
                 moved = np.where(np.isfinite(q[:, 0]), moved, np.nan)
                 rows, tries = np.flatnonzero(np.isfinite(moved)), 0
                 while len(rows):
-                    change = sign * moved[rows] / self._thing.lever
-                    poses = self._thing.placed_joint.poses(position + change)
+                    change = sign[rows] * moved[rows] / self._thing.lever
+                    poses = self._thing.placed_joint.poses(position[rows] + change)
                     poses[:, 2] -= _DEPTH * edge
                     rows = rows[~self._finder.links.free(q[rows], poses)]
                     moved[rows] += _MOVE * edge if tries < _MOVES else np.nan
@@ -223,8 +257,9 @@ class ScriptedArticulated:
         self._num_plans[new], self._num_failed[new] = 0, 0
         failed = self._advance(task, position) | (ours & ~self._active)
         left = (self._num_plans < MAX_PLANS) & (self._num_failed < MAX_FAILED)
-        for env in torch.nonzero(new | (failed & left))[:, 0].tolist():
-            self._plan(task, env, float(position[env]), float(goal[env]), is_new=bool(new[env]))
+        self._pushing &= ~new
+        for (robot, _), envs in envs_by_planner(task, new | (failed & left)):
+            self._plan(task, robot, envs, position, goal)
         on_track = self._on_track(self._track)
         targets = torch.where(self._pushing[:, None], on_track, self._follower.waypoint)
         targets = torch.where(self._active[:, None], targets, task.targets)
@@ -266,37 +301,46 @@ class ScriptedArticulated:
         return position, goal
 
     def _plan(
-        self, task: TaskBatch, env: int, position: float, goal: float, *, is_new: bool
+        self,
+        task: TaskBatch,
+        robot: int,
+        envs: Sequence[int],
+        position: torch.Tensor,
+        goal: torch.Tensor,
     ) -> None:
-        """Make a plan in one environment."""
-        robot = int(task.env_robot_index[env])
+        """Make plans in environments of a robot; positions and goals of all joints are (n,)."""
         spec = task.specs[robot]
         if robot not in self._planners:
             rng = np.random.default_rng([self._seed, robot])
             self._planners[robot] = MotionPlanner(spec, task.robot_tables, robot, rng)
         planner, dof = self._planners[robot], spec.robot.dof
-        q = task.targets[env, :dof].double().cpu().numpy()
-        start = q
-        if self._pushing[env] and not is_new:
-            moved = float((position - self._begun[env]) * self._lever[env])
-            track = self._track[env, :, :dof].double().cpu().numpy()
-            start = planner.retreat(q, track, moved / float(self._step[env]), position)
-        steps_left = int(task.max_episode_steps[env] - task.episode_step[env])
-        plan = planner.plan(start, position, goal, int(self._num_plans[env]), steps_left)
-        self._num_plans[env] += 1
-        self._active[env], self._pushing[env] = plan is not None, False
-        if plan is None:
-            self._num_failed[env] += 1
-            return
-        way = plan.path if start is q else (start, *plan.path)
-        self._follower.follow(env, way)
-        self._track[env, :, :dof] = torch.from_numpy(plan.track).to(self._track)
-        self._moves[env] = torch.from_numpy(plan.moves).to(self._moves)
-        self._step[env], self._length[env] = plan.step, plan.length
+        now = [task.targets[env, :dof].double().cpu().numpy() for env in envs]
+        motions = []
+        for env, q in zip(envs, now, strict=True):
+            start, at = q, float(position[env])
+            if self._pushing[env]:
+                moved = float((position[env] - self._begun[env]) * self._lever[env])
+                track = self._track[env, :, :dof].double().cpu().numpy()
+                start = planner.retreat(q, track, moved / float(self._step[env]), at)
+            steps_left = int(task.max_episode_steps[env] - task.episode_step[env])
+            motions.append(
+                Motion(start, at, float(goal[env]), int(self._num_plans[env]), steps_left)
+            )
+        self._num_plans[envs] += 1
+        self._active[envs] = self._pushing[envs] = False
         lever = spec.goals.thing.lever  # type: ignore[attr-defined]  # a set of this task
-        self._lever[env] = lever if goal > position else -lever
-        self._begun[env], self._best[env], self._along[env] = position, 0.0, 0.0
-        self._lead[env], self._settling[env], self._still[env] = LEAD, 0, 0
+        for env, q, motion, plan in zip(envs, now, motions, planner.plan(motions), strict=True):
+            if plan is None:
+                self._num_failed[env] += 1
+                continue
+            self._active[env] = True
+            self._follower.follow(env, plan.path if motion.q is q else (motion.q, *plan.path))
+            self._track[env, :, :dof] = torch.from_numpy(plan.track).to(self._track)
+            self._moves[env] = torch.from_numpy(plan.moves).to(self._moves)
+            self._step[env], self._length[env] = plan.step, plan.length
+            self._lever[env] = lever if motion.goal > motion.position else -lever
+            self._begun[env], self._best[env], self._along[env] = motion.position, 0.0, 0.0
+            self._lead[env], self._settling[env], self._still[env] = LEAD, 0, 0
 
     def _advance(self, task: TaskBatch, position: torch.Tensor) -> torch.Tensor:
         """Go on along the paths and tracks; return where pushes failed, (n,), bool."""

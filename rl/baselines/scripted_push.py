@@ -597,7 +597,7 @@ class ScriptedPush:
         new = is_push & (task.episode_step == 0)
         self._num_plans[new] = 0
         failed = self._advance(task, block, tool) | (is_push & ~self._active)
-        for key, envs in _envs_by_planner(task, new | (failed & (self._num_plans < MAX_PLANS))):
+        for key, envs in envs_by_planner(task, new | (failed & (self._num_plans < MAX_PLANS))):
             self._plan(task, key, envs, block)
         self._height += torch.where(self._blocked(task), RISE, 0.0)
         pushed = self._push(task, block, tool)
@@ -681,7 +681,7 @@ class ScriptedPush:
     def _blocked(self, task: TaskBatch) -> torch.Tensor:
         """Return where a pushing arm's targets collide with anything but the block, (n,), bool."""
         blocked = torch.zeros_like(self._active)
-        for key, envs in _envs_by_planner(task, self._active & self.pushing):
+        for key, envs in envs_by_planner(task, self._active & self.pushing):
             q = task.targets[envs, : task.specs[key[0]].robot.dof].double().cpu().numpy()
             free = self._planners[key].free(q)
             blocked[envs] = ~torch.from_numpy(free).to(blocked.device)
@@ -719,7 +719,7 @@ class ScriptedPush:
         return targets
 
 
-def _envs_by_planner(
+def envs_by_planner(
     task: TaskBatch, mask: torch.Tensor
 ) -> Iterable[tuple[tuple[int, int], list[int]]]:
     """Return the environments of a mask (n,) by the indices of their robot and layout."""
