@@ -55,6 +55,7 @@ PAPER_AGENT = "-symlog-slow-critic-discrete"
 CHANNELS = "+normalize+lag+joint+poses+jacobian+dls"
 AGENTS = {
     "me-graph": "`me-graph`",
+    "me-graph+clearance": "`me-graph`, channel `clearance`",
     f"me-mlp{PAPER_AGENT}{CHANNELS}": "`me-mlp`, kinematic channels",
     f"me-tf{PAPER_AGENT}{CHANNELS}": "`me-tf`, kinematic channels",
     f"me-mlp{PAPER_AGENT}": "`me-mlp`, the paper's observations",
@@ -146,7 +147,7 @@ def split_table(task: str) -> str:
 
 def summary_table() -> str:
     """Return zero-shot success on each split of reach and push, by agent."""
-    columns = ("me-graph", *list(AGENTS)[1:5])
+    columns = ("me-graph", *list(AGENTS)[2:6])
     lines = []
     for task, best in (("reach", "ik"), ("push", "scripted")):
         for split in SPLITS:
