@@ -73,8 +73,5 @@ def show(session: Session) -> None:
     session.on_change(number, play, "play")
     session.on_change(move, step)
     session.apply_state()
-    if number.value:
-        play()  # whatever the other choices
-    else:
-        seek(0)
+    seek(number.value)  # an address may name an episode that its other choices leave out
     page.add_downloads()
