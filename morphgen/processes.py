@@ -31,6 +31,8 @@ CHUNK_SIZE = 8  # default number of items that a worker processes before it repo
 POLL_INTERVAL = 0.2
 """Interval at which workers check whether the parent has stopped, and the parent whether a signal
 was received [s]."""
+IDLE_TIME = 0.5
+"""Time after which a worker ends that is idle though the parent has stopped [s]."""
 CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
 """File in which Linux tells a container how much of the cores it may use."""
 RAY_TIMEOUT = 5.0  # longest wait for the address of a Ray cluster [s]; Ray itself waits for minutes
@@ -39,6 +41,8 @@ _work: Callable[[Any], object]
 _stopped: c_byte | None = None
 """Flag that the parent has stopped, in memory that all its processes share."""
 _is_working = False
+_is_interruptible = False
+"""Whether the work has not been interrupted yet; a second signal shall not end its cleaning up."""
 _is_starting = False
 
 
@@ -213,7 +217,9 @@ def _init_map_worker(work: bytes, stopped: c_byte) -> None:
 
 def _interrupt(*_: object) -> None:
     """Interrupt the work as Ctrl-C would, so that it cleans up; an idle worker continues."""
-    if _is_working:
+    global _is_interruptible
+    if _is_interruptible:
+        _is_interruptible = False
         raise KeyboardInterrupt
 
 
@@ -226,6 +232,12 @@ def _interrupt_when_stopped() -> None:
     main = threading.main_thread().ident
     if main is not None:
         signal.pthread_kill(main, signal.SIGTERM)  # which also interrupts a system call
+    # Where one worker has died, the pool of Python 3.12 only sends SIGTERM to the others, which idle
+    # ones ignore, and waits for them.
+    while True:
+        time.sleep(IDLE_TIME)
+        if not _is_working:
+            os._exit(1)
 
 
 def _end_with_parent() -> None:
@@ -247,15 +259,15 @@ def _working() -> Iterator[Callable[[], bool]]:
 
     Once the parent has stopped, nobody needs the results.
     """
-    global _is_working
+    global _is_working, _is_interruptible
     stopped = _stopped
     if stopped is None:
         raise RuntimeError("the worker was not initialised")
-    _is_working = True
+    _is_working = _is_interruptible = True
     try:
         yield lambda: not stopped.value
     finally:
-        _is_working = False
+        _is_working = _is_interruptible = False
 
 
 @contextmanager

@@ -7,12 +7,13 @@ import subprocess
 import sys
 import time
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from threading import Condition, Thread, current_thread, main_thread
 
 import pytest
 
-from helpers.worker_functions import die, die_at_three, fail, power
+from helpers.worker_functions import be_idle, die, die_at_three, fail, power
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.processes import CHUNK_SIZE, parallel_map
 from morphgen.progress import interrupts, own_progress, part_of, report, show_progress
@@ -50,6 +51,16 @@ def test_a_process_that_dies_while_results_are_used_is_reported():
 
     with pytest.raises(MorphgenError, match="a worker died"):
         list(map(slowly, parallel_map(die_at_three, range(40), 2, chunk=1)))
+
+
+def test_an_idle_worker_ends_soon_after_its_parent_has_stopped():
+    """The pool of Python 3.12 does not tell workers to end where another one has died."""
+    context = get_context("spawn")
+    stopped = context.RawValue("b", 1)
+    worker = context.Process(target=be_idle, args=(stopped,))
+    worker.start()
+    worker.join(50)
+    assert worker.exitcode == 1
 
 
 @pytest.fixture

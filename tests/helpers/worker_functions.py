@@ -4,6 +4,7 @@ import os
 import time
 
 from morphgen.errors import BenchmarkError
+from morphgen.processes import init_worker
 
 
 def power(exponent, base):
@@ -35,3 +36,9 @@ def sleep_from(started):
     """Create a file, then sleep for an hour."""
     started.touch()
     time.sleep(3600)
+
+
+def be_idle(stopped):
+    """Initialise a worker, and wait for work."""
+    init_worker(stopped)
+    time.sleep(60)
