@@ -232,7 +232,7 @@ def _interrupt_when_stopped() -> None:
     main = threading.main_thread().ident
     if main is not None:
         signal.pthread_kill(main, signal.SIGTERM)  # which also interrupts a system call
-    # Where one worker has died, the pool of Python 3.12 only sends SIGTERM to the others, which idle
+    # Where a worker has died, the pool of Python 3.12 only sends SIGTERM to the others, which idle
     # ones ignore, and waits for them.
     while True:
         time.sleep(IDLE_TIME)
