@@ -5,8 +5,10 @@
 
 Runs each distinct pair of robot and task of the shipped splits, with collision shapes of fitted
 primitives and the goals and starts of seed 0. A row gives the success rate of each baseline (reach:
-``ik``, ``jacobian`` and ``random``; push: ``scripted`` and ``random``), and the largest motion of
-the tool in an episode without actions. Obstacles exist only with ``--obstacles``.
+``ik``, ``jacobian`` and ``random``; others: ``scripted`` and ``random``), and the largest motion of
+the tool in an episode without actions. "labels/s" are the steps of the episodes of ``ik`` or
+``scripted`` per second of CPU time, with planning and simulation: the speed of demonstrations.
+Obstacles exist only with ``--obstacles``.
 
 The last rows are means. If a simulator is not installed, its columns are missing and the script
 prints that.
@@ -18,6 +20,7 @@ import argparse
 import json
 import re
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -73,8 +76,13 @@ class Measuring:
                 for name in baselines_for(member.task):
                     if name == "zero":
                         continue
+                    began = time.process_time()
                     episodes = run_episodes(batch, BASELINES[name].make(0), self.episodes)
+                    seconds = time.process_time() - began
                     row[f"{sim} {name}"] = mean(episode.success for episode in episodes)
+                    if name == baselines_for(member.task)[0]:
+                        labels = sum(episode.steps for episode in episodes)
+                        row[f"{sim} labels/s"] = labels / seconds
                 row[f"{sim} drift mm"] = _drift(batch)
         return row
 

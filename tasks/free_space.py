@@ -196,7 +196,7 @@ class FreeSpace:
         """
         count = max(math.ceil(np.abs(end - start).max() / resolution), 1) + 1
         line = start + np.linspace(0, 1, count)[:, None] * (end - start)
-        blocks = None if block is None else np.tile(block, (count, 1))
+        blocks = None if block is None else np.broadcast_to(block, (count, 7))
         free = self.free(line, blocks, stop=True)
         return 1.0 if free.all() else max(int(free.argmin()) - 1, 0) / (count - 1)
 
@@ -312,12 +312,7 @@ class FreeSpace:
             return np.tile(_AWAY, (n, 1)) if self.scene.object else np.zeros((n, 0))
         blocks = np.asarray(blocks, dtype=np.float64)
         self._require_blocks(blocks, n)
-        rotations = blocks[:, 3:]
-        # As along a path, most rotations are that of the row before.
-        is_new = np.ones(n, dtype=np.bool_)
-        is_new[1:] = (rotations[1:] != rotations[:-1]).any(axis=1)
-        turns = [_rpy(*rotation) for rotation in rotations[is_new].tolist()]
-        rpy = np.array(turns).reshape(-1, 3)[is_new.cumsum() - 1]
+        rpy = np.array([_rpy(*rotation) for rotation in blocks[:, 3:].tolist()]).reshape(-1, 3)
         return np.concatenate([blocks[:, :3], rpy[:, ::-1]], axis=1)
 
     def _require_blocks(self, blocks: Array, n: int) -> None:

@@ -363,8 +363,10 @@ class PathFinder:
             if point > 0:
                 good &= np.abs(q - before).max(axis=1) < _LARGEST_STEP
             good[good] = self.space.free(q[good], poses[rows[good], point])
-            touched = [~self.links.free(q[good], each[rows[good], point]) for each in nearer]
-            good[good] = np.any(touched, axis=0)
+            beside = np.flatnonzero(good)
+            for each in nearer:
+                beside = beside[self.links.free(q[beside], each[rows[beside], point])]
+            good[beside] = False
             q, rows = q[good], rows[good]
             paths[rows, point] = q
         return paths
