@@ -113,7 +113,7 @@ def _bar(
         desc=title,
         unit=f" {unit}",
         total=total,
-        bar_format=layout,
+        bar_format=None if total is None else layout,
         file=sys.stderr,
         delay=delay,
         leave=False,
@@ -121,7 +121,8 @@ def _bar(
 
     def show(done: float, total: int | None) -> None:
         raise_if_interrupted()
-        shown.total = shown.total if total is None else total
+        if total is not None:
+            shown.total, shown.bar_format = total, layout
         shown.update(done - shown.n)  # tqdm counts steps, reports are sums
 
     with shown:
