@@ -1,5 +1,6 @@
 """Submissions: their file, every check, scores, ranking and references."""
 
+import contextlib
 import json
 import math
 
@@ -31,6 +32,20 @@ def test_a_valid_submission_passes():
     check(only_test)
     check(data(episodes=9))
     check({**data(), "morphgen": "0.7.9"})
+
+
+@pytest.mark.parametrize(
+    ("own", "version", "why"),
+    [
+        ("0.3.0", "0.4.1", None),
+        ("0.4.0", "0.3.0", None),
+        ("0.5.0", "0.4.1", r"0\.5\.0; scores are compared with those of version 0\.4\.1"),
+    ],
+)
+def test_submissions_of_0_3_are_scored_with_those_of_0_4(own, version, why):
+    checked = submission({**data(), "morphgen": own})
+    with pytest.raises(BenchmarkError, match=why) if why else contextlib.nullcontext():
+        check_submission(checked, "s.json", SPLIT, PROTOCOL, EXPECTED, version)
 
 
 def test_a_submission_is_read_as_it_was_written(tmp_path):
