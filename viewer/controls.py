@@ -8,13 +8,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import viser
 
 from morphgen.grammar.robot_source import is_set_folder
+from morphgen.model.kinematics import driving_joints, joint_limits
+from morphgen.model.robot import TOOL, Robot
 from morphgen.splits.split_file import split_names
+from morphgen.typing import Array
 from morphgen.viewer.app.address import AddressError, parse_count
 from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.robot_rows import folder_rows, robot_folders, split_rows
+from morphgen.viewer.robot_tables import has_tool
 from morphgen.viewer.robot_uri import WORDS, FileAccess, member_split, parent_folder, resolve_split
 
 
@@ -72,6 +77,44 @@ def parse_value(control: Any, text: str, keys: Sequence[str] = ()) -> Any:  # no
             low, high = control.min, control.max
             return None if math.isnan(number) else type(low)(min(max(number, low), high))
     return text
+
+
+def joint_roles(robot: Robot) -> list[str]:
+    """Return the role of every independent joint, in the order of q.
+
+    ``joint 1`` is the first joint on the path from the root to the tool, perhaps through a mimic
+    joint; ``finger 1`` the first that does not move the tool.
+    """
+    on_path: tuple[int, ...] = ()
+    if has_tool(robot):
+        on_path = driving_joints(robot, robot.joint_chain(robot.frame(TOOL).link))
+    off_path = [i for i in range(robot.dof) if i not in on_path]
+    roles = {i: f"joint {n}" for n, i in enumerate(on_path, 1)}
+    roles |= {i: f"finger {n}" for n, i in enumerate(off_path, 1)}
+    return [roles[i] for i in range(robot.dof)]
+
+
+def all_roles(robots: Sequence[Robot]) -> list[str]:
+    """Return every role of any of the robots, joints before fingers, by number."""
+    roles = {role for robot in robots for role in joint_roles(robot)}
+    return sorted(roles, key=lambda role: (role[0] != "j", int(role.split()[1])))
+
+
+def normalized_positions(robot: Robot, q: Array) -> Array:
+    """Map joint positions to -1 at the lower limit and 1 at the upper, shape (dof,)."""
+    low, high = joint_limits(robot).T
+    half_range = np.where(high > low, (high - low) / 2, 1.0)
+    return np.asarray((q - (low + high) / 2) / half_range)
+
+
+def with_roles(robot: Robot, q: Array, values: Mapping[str, float]) -> Array:
+    """Return a configuration (dof,) with the joints of some roles moved, clipped to the limits."""
+    low, high = joint_limits(robot).T
+    target = np.array(q, dtype=np.float64)
+    for i, role in enumerate(joint_roles(robot)):
+        if role in values:
+            target[i] = (low[i] + high[i]) / 2 + values[role] * (high[i] - low[i]) / 2
+    return np.asarray(np.clip(target, low, high))
 
 
 class RoleSliders:

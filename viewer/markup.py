@@ -9,7 +9,7 @@ from morphgen.model.findings import Finding
 from morphgen.viewer.app.address import Address
 
 SELECTED = "#00bedc"
-"""Colour of what belongs to the selected link: ``scene_selection.SELECTED``."""
+"""Colour of what belongs to the selected link: ``scene.overlays.SELECTED``."""
 
 
 def framed(*content: str) -> str:

@@ -66,7 +66,7 @@ def loader_copy(path: Path, finder: PackageFinder | None = None) -> Iterator[Pat
 
 
 def _copy_mjcf(path: Path, folder: Path, finder: PackageFinder) -> None:
-    from morphgen.formats.mjcf.compile import compile_document  # loads trimesh
+    from morphgen.formats.mjcf.read import compile_document  # loads trimesh
 
     document = read_document(path, finder, with_options=True)
     compile_document(document)

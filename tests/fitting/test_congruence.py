@@ -6,8 +6,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from morphgen.fitting.canonical import canonical
-from morphgen.fitting.congruence import congruence, moved, representatives
 from morphgen.fitting.quality import signed_distance
+from morphgen.fitting.robot_fit import congruence, moved, representatives
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere, dimensions

@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 from helpers.robots import arm
 from morphgen.errors import FitError, FormatError
 from morphgen.fitting.canonical import KINDS, Kind
-from morphgen.fitting.enclose import enclose
-from morphgen.fitting.link_fit import FitOptions, fit_shapes
+from morphgen.fitting.link_fit import FitOptions, enclose, fit_shapes
 from morphgen.fitting.quality import Quality, quality, signed_distance
 from morphgen.fitting.replace_collision import as_spheres, has_only_spheres, link_spheres
 from morphgen.fitting.search import (

@@ -9,7 +9,7 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
-from morphgen.viewer.pages.compose_tabs import (
+from morphgen.viewer.pages.compose import (
     first_parts,
     parameters_of,
     slots_of,

@@ -19,28 +19,22 @@ from morphgen.model.geometry import Capsule, Shape
 from morphgen.model.kinematics import forward_kinematics, joint_limits
 from morphgen.model.robot import Link, Robot
 from morphgen.splits.split_file import find_split, read_split
-from morphgen.viewer import population as population_arrays
 from morphgen.viewer.app.address import AddressError, parse_address
-from morphgen.viewer.comparison import (
-    all_roles,
-    compare_robots,
-    joint_roles,
-    normalized_positions,
-    similarity_table,
-    with_roles,
-)
+from morphgen.viewer.controls import all_roles, joint_roles, normalized_positions, with_roles
 from morphgen.viewer.figures import heatmap_svg, histogram_svg, map_svg
-from morphgen.viewer.gallery import parse_range
 from morphgen.viewer.pages import population as population_page
-from morphgen.viewer.pages.gallery import choose_sides
-from morphgen.viewer.pages.population import format_selection, parse_selection, selection_text
-from morphgen.viewer.population import (
+from morphgen.viewer.pages.compare import compare_robots, similarity_table
+from morphgen.viewer.pages.gallery import choose_sides, parse_range
+from morphgen.viewer.pages.population import (
     ReadRobot,
     arrange,
     find_source,
+    format_selection,
     make_population,
     move_roles,
+    parse_selection,
     read_robots,
+    selection_text,
     shape_poses,
 )
 from morphgen.viewer.robot_rows import Row
@@ -385,8 +379,7 @@ def test_the_key_of_a_population_changes_with_its_files(folder, tmp_path):
 
 @pytest.mark.slow
 def test_a_large_population_says_that_it_has_no_shadows(shared_viewer, monkeypatch):
-    for module in (population_arrays, population_page):
-        monkeypatch.setattr(module, "MAX_SHADOWS", 10)
+    monkeypatch.setattr(population_page, "MAX_SHADOWS", 10)
     with PlainClient(shared_viewer.port, "?population=robots/prims") as client:
         client.shows("without shadows: more than 10 robots")
         batches = [m for m in client.messages if m["type"] == "BatchedMeshesMessage"]

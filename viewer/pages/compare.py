@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
+from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import viser
 
+from morphgen.encoding.similarity import MEASURES, features, similarity_matrix
+from morphgen.encoding.tokens import default_max_links
 from morphgen.errors import MorphgenError
+from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import split_colours
+from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
-from morphgen.viewer import comparison, markup
+from morphgen.typing import Array
+from morphgen.viewer import markup
 from morphgen.viewer.app.address import MAX_COMPARED, Address
 from morphgen.viewer.app.session import Session
-from morphgen.viewer.controls import RoleSliders, add_picker, picked_uri, robot_lists
-from morphgen.viewer.robot_uri import UriError, read_robot_uri, uri_name
+from morphgen.viewer.controls import (
+    RoleSliders,
+    add_picker,
+    all_roles,
+    joint_roles,
+    normalized_positions,
+    picked_uri,
+    robot_lists,
+    with_roles,
+)
+from morphgen.viewer.robot_uri import UriError, read_robot_uri, uri_name, with_library_meshes
 from morphgen.viewer.scene import robot as scene_robot
 from morphgen.viewer.scene import stage as scene_stage
 
@@ -133,32 +149,30 @@ def _add_move_tab(page: ComparePage) -> None:
     session = page.session
     buttons = session.client.gui.add_button_group("Go to", ("home", "middle"))
     sliders = page.sliders = RoleSliders(session, -1.0, lambda: _move(page))
-    roles = comparison.all_roles(page.robots)
+    roles = all_roles(page.robots)
 
     def go_to_target() -> None:
         sliders.set({} if buttons.value == "home" else dict.fromkeys(roles, 0.0))
 
     session.on_change(buttons, go_to_target)
     for role in roles:
-        names = ", ".join(
-            robot.name for robot in page.robots if role in comparison.joint_roles(robot)
-        )
+        names = ", ".join(robot.name for robot in page.robots if role in joint_roles(robot))
         hint = f"-1 is the lower limit, 1 the upper; of {names}"
         sliders.add(role, _home_value(page, role), hint)
 
 
 def _home_value(page: ComparePage, role: str) -> float:
     """Return a role's normalized home position of the first robot that has the role."""
-    robot = next(robot for robot in page.robots if role in comparison.joint_roles(robot))
-    home = comparison.normalized_positions(robot, np.array(robot.home))
-    return float(np.clip(home[comparison.joint_roles(robot).index(role)], -1, 1))
+    robot = next(robot for robot in page.robots if role in joint_roles(robot))
+    home = normalized_positions(robot, np.array(robot.home))
+    return float(np.clip(home[joint_roles(robot).index(role)], -1, 1))
 
 
 def _move(page: ComparePage) -> None:
     """Move every robot: moved roles to their positions, other joints to their home."""
     with page.session.client.atomic():
         for robot, view in zip(page.robots, page.views, strict=True):
-            q = comparison.with_roles(robot, np.array(robot.home), page.sliders.moved)
+            q = with_roles(robot, np.array(robot.home), page.sliders.moved)
             view.set_configuration(q)
     page.session.show_state_later()
 
@@ -172,9 +186,38 @@ def _compare(page: ComparePage) -> None:
     try:
         folders = session.files.library_folders
         with session.activity("comparing"):
-            similarity = session.run_in_worker(comparison.compare_robots, page.robots, folders)
-        content = f"<h3>Similarity</h3>{comparison.similarity_table(names, similarity)}"
+            similarity = session.run_in_worker(compare_robots, page.robots, folders)
+        content = f"<h3>Similarity</h3>{similarity_table(names, similarity)}"
     except MorphgenError as error:
         tag = markup.tag("cannot be compared", "warning")
         content = f"{tag}{escape(session.files.redact(error))}"
     page.similarity.content = markup.framed(content)
+
+
+def compare_robots(robots: Sequence[Robot], folders: Sequence[Path]) -> dict[str, Array]:
+    """Return the similarity of every pair by measure, shape (n, n). Runs in a worker."""
+    library = Library(folders)
+    shapes = [token_shapes(with_library_meshes(robot, library), folders) for robot in robots]
+    # Splits fix the number of links; here the largest robot does.
+    max_links = default_max_links(len(robot.links) for robot in robots)
+    compared = [
+        features(robot, shape, max_links=max_links)
+        for robot, shape in zip(robots, shapes, strict=True)
+    ]
+    return {name: similarity_matrix(compared, name) for name in MEASURES}
+
+
+def similarity_table(names: Sequence[str], similarity: Mapping[str, Array]) -> str:
+    """Return a table with a row for each pair of robots and a column for each measure."""
+    header = [""]
+    for name, measure in MEASURES.items():
+        direction = "larger" if measure.larger_is_more_alike else "smaller"
+        header.append(f"{name} ({direction} is more similar)")
+    rows = [
+        (
+            f"{escape(names[i])} and {escape(names[j])}",
+            *(f"{similarity[name][i, j]:.3f}" for name in MEASURES),
+        )
+        for i, j in combinations(range(len(names)), 2)
+    ]
+    return markup.table(header, rows, range(1, len(header)))

@@ -1,11 +1,14 @@
-"""The page that composes robots, from chosen parts or from a grammar."""
+"""The page that composes robots, from chosen parts, of parameters, or from a grammar."""
 
 from __future__ import annotations
 
 import functools
+import re
+import shlex
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 
@@ -13,41 +16,42 @@ import numpy as np
 import viser
 
 from morphgen.checks import check
-from morphgen.errors import CompositionError
+from morphgen.errors import CompositionError, MorphgenError
 from morphgen.formats.bundle import bundle_folder, split_colours, write_bundle
-from morphgen.grammar.derivation import Derivation, parse_derivation
-from morphgen.grammar.grammar_file import SUFFIX
-from morphgen.grammar.request import known_grammars
+from morphgen.formats.rounding import format_number
+from morphgen.grammar.compose import compose
+from morphgen.grammar.derivation import Derivation, outline, parse_derivation
+from morphgen.grammar.derive import FirstChooser, derive
+from morphgen.grammar.grammar_file import SUFFIX, grammar_from_text, grammar_names, grammar_text
+from morphgen.grammar.library import Library
+from morphgen.grammar.manifest import Parameter, PartKind, parse_value
+from morphgen.grammar.request import MAIN_PORTS, SLOTS, default_name, known_grammars, parse_request
 from morphgen.grammar.robot_set import GRAMMAR
+from morphgen.grammar.sampling import sample_robot
 from morphgen.model.inertia import box_corners
 from morphgen.model.kinematics import arm_reach
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
 from morphgen.viewer import markup
-from morphgen.viewer.app.address import Address
-from morphgen.viewer.app.session import Session
-from morphgen.viewer.pages.compose_tabs import (
-    ComposingTab,
-    GrammarTab,
-    ParametersTab,
-    PartsTab,
-    Shown,
-    split_words,
-    words_of,
-)
+from morphgen.viewer.app.address import Address, AddressError, pack_text, parse_count, unpack_text
+from morphgen.viewer.app.frame import call
+from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.pages.robot import PANEL_WIDTH, summary
 from morphgen.viewer.robot_files import new_bundle_files, zip_files
-from morphgen.viewer.robot_tables import has_tool
+from morphgen.viewer.robot_tables import has_tool, part_title, slider_step
 from morphgen.viewer.robot_uri import (
     DEFAULT_WORDS,
     DERIVATION,
     MEMBER,
     UPLOAD,
+    WORDS,
     FileAccess,
     UriError,
     parent_folder,
     read_robot_uri,
     resolve_derivation,
+    resolve_grammar,
+    resolve_words,
     shorten,
 )
 from morphgen.viewer.scene.robot import RobotView, add_robot, robot_bounds
@@ -58,6 +62,423 @@ from morphgen.viewer.scene.stage import (
     look_at,
     project_points,
 )
+
+NO_PART = "(none)"  # option of a dropdown that leaves a slot empty
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A robot that the page shows."""
+
+    robot: Robot
+    derivation: Derivation
+    command: str  # command that makes the robot, or a comment with its derivation
+    uri: str  # URI of the robot
+    subject: str  # subject of the page's address that shows the robot again
+
+
+ShowRobot = Callable[[Shown], None]
+Words = Mapping[str, str]
+"""Words of ``morphgen compose`` by their keys: a part for each slot, and values of parameters."""
+
+
+def split_words(text: str) -> Words:
+    """Return the words of a text by their keys; ``parse_request`` says which are invalid."""
+    parts = (word.partition("=") for word in text.split())
+    return {"base": "fixed"} | {key: value for key, _, value in parts}
+
+
+def kind_of(slot: str) -> PartKind:
+    """Return the kind of part that a slot takes, such as ``arm`` for ``left.arm``."""
+    last = slot.rpartition(".")[2]
+    return next(kind for kind in SLOTS if kind == last)
+
+
+def slots_of(words: Words, library: Library) -> list[str]:
+    """Return the slots that the chosen parts offer, except the base's own slot.
+
+    Every port of the base takes an arm with an end-effector on each of the arm's ports. Beside a
+    main arm, an end-effector on another port of the base needs an arm there.
+    """
+    base = library.manifest(words["base"], "base")
+    arm = words.get("arm")
+    ports = list(library.manifest(arm, "arm").ports) if arm else [MAIN_PORTS["arm"]]
+    slots = ["arm", *("ee" if port == MAIN_PORTS["arm"] else f"{port}.ee" for port in ports)]
+    for port in base.ports:
+        if port != MAIN_PORTS["base"]:
+            slots.append(f"{port}.arm")
+            if not arm or words.get(f"{port}.arm"):
+                slots.append(f"{port}.ee")
+    return list(dict.fromkeys(slots))
+
+
+def parameters_of(slot: str, part: str, library: Library) -> Mapping[str, Parameter]:
+    """Return the parameters of a part in a slot: its own, and the rotation of its mount."""
+    manifest = library.manifest(part, kind_of(slot))
+    return manifest.parameters if slot == "base" else manifest.attached_parameters
+
+
+def words_of(derivation: Derivation, library: Library) -> Words | None:
+    """Return the words that give a derivation; None if words cannot describe it."""
+    words = {}
+    for node in derivation.walk():
+        limb, _, kind = node.label.rpartition("_")
+        if kind not in SLOTS:
+            return None
+        slot = f"{limb}.{kind}" if limb else kind
+        if node.part == "none":
+            continue
+        words[slot] = node.part
+        for name, value in node.parameters:
+            default = parameters_of(slot, node.part, library)[name].default
+            if (text := format_number(value)) != format_number(default):
+                words[f"{slot}.{name}"] = text
+    try:
+        return words if parse_request(_texts(words), library) == derivation else None
+    except MorphgenError:
+        return None  # labels that only look like slots
+
+
+def with_word(words: Words, key: str, value: str, library: Library) -> Words:
+    """Return words with another value of a key, or without the key if the value is empty.
+
+    A slot loses the parameters of its previous part; slots and parameters that the chosen parts no
+    longer have are left out.
+    """
+    words = {other: text for other, text in {**words, key: value}.items() if text}
+    slots = {"base", *slots_of(words, library)}
+
+    def is_kept(other: str) -> bool:
+        slot, _, name = other.rpartition(".")
+        if other in slots or slot not in slots or slot not in words or slot == key:
+            return other in slots
+        return name in parameters_of(slot, words[slot], library)
+
+    return {other: text for other, text in words.items() if is_kept(other)}
+
+
+def _texts(words: Words) -> list[str]:
+    return [f"{key}={value}" for key, value in words.items()]
+
+
+class ComposingTab(ABC):
+    """A tab whose controls compose a robot."""
+
+    _fault: viser.GuiHtmlHandle  # reason why no robot can be composed, or empty
+
+    def __init__(self, session: Session, show_robot: ShowRobot) -> None:
+        """Prepare the tab; ``show_robot`` shows a composed robot."""
+        self._session, self._library, self._show_robot = session, session.files.library, show_robot
+
+    @abstractmethod
+    def _compose(self) -> Shown:
+        """Return the robot that the controls describe."""
+
+    def show(self) -> None:
+        """Show the robot, or why it cannot be composed; then the last robot stays."""
+        try:
+            shown = self._compose()
+        except (MorphgenError, RecursionError) as error:
+            self._show_fault(self._session.files.redact(error))
+            return
+        self._show_robot(shown)
+        self._show_fault("")
+
+    def _show_fault(self, text: str) -> None:
+        self._fault.content = markup.error(text) if text else ""
+
+    def _add_slider(
+        self,
+        name: str,
+        parameter: Parameter,
+        value: float,
+        key: str,
+        change: Callable[[float], None],
+    ) -> None:
+        """Add the slider of a part's parameter."""
+        low, high = parameter.minimum, parameter.maximum
+        slider = self._session.client.gui.add_slider(
+            name.replace("_", " ") + (f" ({parameter.unit})" if parameter.unit else ""),
+            low,
+            high,
+            1.0 if parameter.integer else slider_step(low, high),
+            min(max(value, low), high),
+            marks=tuple((end, f"{end:.3g}") for end in (low, high)),
+            hint=parameter.summary or name,
+        )
+        self._session.on_change(slider, lambda: change(slider.value), key)
+
+
+class PartsTab(ComposingTab):
+    """The tab with a dropdown of parts for the base and its slots, and sliders of parameters."""
+
+    def __init__(
+        self, session: Session, tabs: viser.GuiTabGroupHandle, words: Words, show_robot: ShowRobot
+    ) -> None:
+        """Add the tab; ``show`` shows the robot of the words."""
+        super().__init__(session, show_robot)
+        gui, self._words = session.client.gui, words
+        self._slots: list[viser.GuiFolderHandle] = []  # folders with the controls of each slot
+        self._library.manifest(words["base"], "base")  # require that there is such a base
+        with tabs.add_tab("Parts", viser.Icon.PUZZLE):
+            self._fault = gui.add_html("")
+            bases = tuple(self._library.names("base"))
+            base = gui.add_dropdown("base", bases, initial_value=self._words["base"])
+            self._folder = gui.add_folder(None)
+        session.on_change(base, lambda: self._choose("base", base.value))
+        self._add_slots()
+
+    def _compose(self) -> Shown:
+        words = _texts(self._words)
+        text = " ".join(words)
+        derivation, name = resolve_words(text, self._session.files)
+        robot = compose(derivation, self._library, name)
+        command = shlex.join(["morphgen", "compose", *words])
+        return Shown(robot, derivation, command, WORDS + text, text)
+
+    def _add_slots(self) -> None:
+        """Add for each slot a dropdown of parts, and sliders of the chosen part's parameters."""
+        for folder in self._slots:
+            folder.remove()
+        self._slots = []
+        for slot in ("base", *slots_of(self._words, self._library)):
+            with self._folder:
+                self._slots.append(folder := self._session.client.gui.add_folder(slot))
+            with folder:
+                if slot != "base":
+                    self._add_part_dropdown(slot)
+                if part := self._words.get(slot):
+                    for name, parameter in parameters_of(slot, part, self._library).items():
+                        key = f"{slot}.{name}"
+                        text, default = self._words.get(key), parameter.default
+                        value = parse_value(text, parameter, key) if text else default
+                        change = functools.partial(self._change, key, default)
+                        self._add_slider(name, parameter, value, key, change)
+
+    def _add_part_dropdown(self, slot: str) -> None:
+        kind, chosen = kind_of(slot), self._words.get(slot)
+        names = (NO_PART, *(name for name in self._library.names(kind) if name != "none"))
+        dropdown = self._session.client.gui.add_dropdown(
+            kind, names, initial_value=chosen if chosen in names else NO_PART
+        )
+        self._session.on_change(dropdown, lambda: self._choose(slot, dropdown.value))
+
+    def _choose(self, slot: str, part: str) -> None:
+        """Put a part into a slot, and show its controls and the robot."""
+        part = "" if part == NO_PART else part
+        self._words = with_word(self._words, slot, part, self._library)
+        self._add_slots()
+        self.show()
+
+    def _change(self, key: str, default: float, value: float) -> None:
+        text = format_number(value) if abs(value - default) > 1e-9 else ""
+        self._words = with_word(self._words, key, text, self._library)
+        self.show()
+
+
+class ParametersTab(ComposingTab):
+    """The tab with sliders for every part of a derivation that words cannot describe."""
+
+    def __init__(
+        self,
+        session: Session,
+        tabs: viser.GuiTabGroupHandle,
+        derivation: Derivation,
+        show_robot: ShowRobot,
+    ) -> None:
+        """Add the tab; ``show`` shows the robot."""
+        super().__init__(session, show_robot)
+        gui, self._derivation = session.client.gui, derivation
+        with tabs.add_tab("Parameters", viser.Icon.ADJUSTMENTS):
+            self._fault = gui.add_html("")
+            for node in derivation.walk():
+                manifest, values = self._library.manifest(node.part), dict(node.parameters)
+                is_root = node is derivation
+                parameters = manifest.parameters if is_root else manifest.attached_parameters
+                if names := [name for name in parameters if name in values]:
+                    with gui.add_folder(part_title(node.label, node.part)):
+                        for name in names:
+                            change = functools.partial(self._change, node.label, name)
+                            key = f"{node.label}.{name}"
+                            self._add_slider(name, parameters[name], values[name], key, change)
+
+    def _compose(self) -> Shown:
+        derivation = self._derivation
+        uri = f"{DERIVATION}{derivation}"
+        robot = compose(derivation, self._library, default_name(derivation, self._library))
+        return Shown(robot, derivation, f"# {derivation}", uri, uri)
+
+    def _change(self, label: str, name: str, value: float) -> None:
+        self._derivation = with_parameter(self._derivation, label, name, value)
+        self.show()
+
+
+def with_parameter(derivation: Derivation, label: str, name: str, value: float) -> Derivation:
+    """Return a derivation with another value of a parameter of the part with a label."""
+    parameters = derivation.parameters
+    if derivation.label == label:
+        values = {**dict(parameters), name: value}
+        parameters = tuple(values.items())
+    children = tuple(
+        (port, with_parameter(child, label, name, value)) for port, child in derivation.children
+    )
+    return replace(derivation, parameters=parameters, children=children)
+
+
+_LOCATION = re.compile(r"(?P<origin>[^\s:]+):(?P<line>\d+):(?P<column>\d+): ")
+"""Beginning of an error that names a place in a grammar."""
+
+
+class GrammarTab(ComposingTab):
+    """The tab of a grammar's text, from which robots are drawn."""
+
+    def __init__(
+        self, session: Session, tabs: viser.GuiTabGroupHandle, source: str, show_robot: ShowRobot
+    ) -> None:
+        """Add the tab with the text of a grammar, given by its name or file."""
+        super().__init__(session, show_robot)
+        gui = session.client.gui
+        self._source, self._name, self._original = source, "", ""
+        self._is_drawn = False  # whether the robot is drawn by seed and number, or the typical one
+        self._derivation: Derivation | None = None  # the whole robot's; fewer parts may be shown
+        with tabs.add_tab("Grammar", viser.Icon.BINARY_TREE):
+            # A grammar may also be one of a file.
+            start = gui.add_dropdown("start from", tuple(dict.fromkeys((source, *grammar_names()))))
+            self._text = gui.add_text("grammar", "", multiline=True)
+            save = gui.add_button("Save the grammar", icon=viser.Icon.DOWNLOAD)
+            self._fault = gui.add_html("")
+            self._too_long = gui.add_html("")
+            self._seed = gui.add_number("seed", 0, min=0, step=1)
+            self._number = gui.add_number("robot number", 0, min=0, step=1)
+            buttons = gui.add_button_group("robot", ("typical", "this", "next"))
+            hint = "how much of the derivation is shown"
+            self._num_parts = gui.add_slider("parts shown", 1, 2, 1, 1, hint=hint)
+            self._tree = gui.add_html("")
+        self._load(source)
+        session.on_change(start, lambda: self._start_from(start.value))
+        session.on_change(self._text, self.show, "grammar")
+        session.on_change(buttons, lambda: self._draw(buttons.value))
+        session.on_change(save, self._send)
+        session.on_change(self._num_parts, self._show_parts, "parts")
+        session.keep("text", self._write_text, self._apply_text)
+        for key, field in (("seed", self._seed), ("number", self._number)):
+            session.on_change(field, lambda: self._draw("this"), "number")
+            session.keep(
+                key,
+                functools.partial(self._write_number, field),
+                functools.partial(self._apply_number, field),
+            )
+
+    def _load(self, source: str) -> None:
+        """Replace the text by that of another grammar."""
+        self._source = source
+        self._name = Path(source).stem if source.endswith(SUFFIX) else source
+        self._original = grammar_text(resolve_grammar(source, self._session.files))
+        set_value(self._text, self._original)
+
+    def _write_number(self, field: viser.GuiNumberHandle[int]) -> str:
+        # Without a text that is too long for it, the address would name another robot.
+        is_named = self._is_shown and self._is_drawn and not self._too_long.content
+        return str(field.value) if is_named else ""
+
+    def _apply_number(self, field: viser.GuiNumberHandle[int], text: str) -> None:
+        self._is_drawn = True
+        set_value(field, parse_count(text, 0))
+
+    def _write_text(self) -> str:
+        self._too_long.content = ""
+        if self._is_shown and self._text.value != self._original:
+            try:
+                return pack_text(self._text.value)
+            except AddressError as error:
+                self._too_long.content = markup.framed(markup.dim(str(error)))
+        return ""
+
+    def _apply_text(self, text: str) -> None:
+        set_value(self._text, unpack_text(text))
+
+    @property
+    def _is_shown(self) -> bool:
+        """Whether the robot of the page is one of this tab."""
+        return self._session.address.subject == self._source
+
+    def _compose(self) -> Shown:
+        session, library = self._session, self._library
+        grammar = grammar_from_text(self._text.value, self._name)
+        derivation = derive(grammar, library, FirstChooser())
+        robot = compose(derivation, library, self._name)  # also checks the grammar
+        is_edited = self._text.value != self._original
+        name = shlex.quote(f"{self._name}{SUFFIX}" if is_edited else self._source)
+        command = f"morphgen compose {name}"
+        if self._is_drawn:
+            seed, number = self._seed.value, self._number.value
+            with session.activity(f"drawing robot {number} of seed {seed}"):
+                sample = sample_robot(grammar, library, number, seed=seed)
+            robot, derivation = sample.robot, sample.derivation
+            command = f"morphgen sample {name} -n {number + 1} --seed {seed}"
+        if is_edited:
+            command = f"# with the text of the tab Grammar in {name}\n{command}"
+        self._derivation = derivation
+        n = sum(1 for _ in derivation.walk())
+        self._num_parts.max = max(n, 2)  # a slider needs a range
+        set_value(self._num_parts, n)
+        self._show_tree(derivation, n)
+        return Shown(robot, derivation, command, f"{DERIVATION}{derivation}", self._source)
+
+    def _show_fault(self, text: str) -> None:
+        """Show what is wrong with the grammar, below the text and at its place in the text."""
+        super()._show_fault(text)
+        if text:  # the address has the text that is wrong
+            self._session.address = replace(self._session.address, subjects=(self._source,))
+            self._session.show_state()
+        place = _LOCATION.match(text)
+        is_here = place is not None and place["origin"] == self._name
+        line, column = (int(place["line"]), int(place["column"])) if place and is_here else (0, 0)
+        self._session.run_script(call("mark", line, column))
+
+    def _send(self) -> None:
+        """Let the browser save the text as a file."""
+        self._session.send_file(f"{self._name}{SUFFIX}", self._text.value.encode())
+
+    def _start_from(self, source: str) -> None:
+        """Show the typical robot of another grammar."""
+        self._load(source)
+        self._draw("typical")
+
+    def _draw(self, action: str) -> None:
+        """Show the ``typical`` robot, ``this`` sampled one, or the ``next``."""
+        if action == "next":
+            set_value(self._number, self._number.value + 1)
+        self._is_drawn = action != "typical"
+        self.show()
+
+    def _show_parts(self) -> None:
+        """Show the robot with the number of parts that the slider gives."""
+        if self._derivation is None:
+            return
+        partial = first_parts(self._derivation, self._num_parts.value)
+        self._show_tree(self._derivation, self._num_parts.value)
+        robot = compose(partial, self._library, self._name)
+        uri = f"{DERIVATION}{partial}"
+        self._show_robot(Shown(robot, partial, f"# {partial}", uri, self._source))
+
+    def _show_tree(self, derivation: Derivation, n: int) -> None:
+        """Show the derivation as a tree; parts beyond the first ``n`` are grey."""
+        lines = [escape(line) for line in outline(derivation).splitlines()]
+        lines[n:] = [f'<span class="dim">{line}</span>' for line in lines[n:]]
+        self._tree.content = markup.framed(f"<h3>Derivation</h3><pre>{'<br>'.join(lines)}</pre>")
+
+
+def first_parts(derivation: Derivation, n: int) -> Derivation:
+    """Return a derivation of only the first ``n`` parts (at least 1), in order of attachment."""
+    kept_ids = {id(node) for node in list(derivation.walk())[: max(n, 1)]}
+
+    def prune(node: Derivation) -> Derivation:
+        children = ((port, prune(child)) for port, child in node.children if id(child) in kept_ids)
+        return replace(node, children=tuple(children))
+
+    return prune(derivation)
+
 
 ROBOTS = "robots"  # folder in which bundles are written
 DEFAULT_GRAMMAR = "arm3"

@@ -2,32 +2,408 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, wait
+from dataclasses import dataclass, field, replace
+from html import escape
+from typing import Any
 
 import viser
 
 from morphgen.errors import BenchmarkError, MorphgenError
+from morphgen.formats.bundle import PICTURE
 from morphgen.grammar.grammar_file import grammar_names
 from morphgen.rl.demonstrations.lerobot import RECORDING
 from morphgen.splits.split import SIDES
 from morphgen.splits.split_file import split_names
-from morphgen.viewer import markup
-from morphgen.viewer.app.address import Address
+from morphgen.viewer import figures, markup, robot_rows
+from morphgen.viewer.app.address import Address, AddressError, parse_count
+from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.session import Session
 from morphgen.viewer.app.uploads import store_upload
+from morphgen.viewer.app.workers import WorkerDied
 from morphgen.viewer.controls import bind
-from morphgen.viewer.gallery import Gallery, add_controls, open_panels, passing_rows, show_page
+from morphgen.viewer.robot_files import Thumbnail, make_thumbnail, thumbnail_of_picture
 from morphgen.viewer.robot_rows import (
+    FILTERS,
+    UNITS,
+    WORDS_OF_ROWS,
     Row,
     folder_rows,
     part_rows,
+    passes,
     robot_folders,
     robot_subfolders,
     uri_rows,
 )
 from morphgen.viewer.robot_uri import DEFAULT_WORDS, FileAccess
 from morphgen.viewer.splits import SPLITS, ChooseSides, add_split_form
+
+
+@dataclass(eq=False)
+class Gallery:
+    """A gallery in one browser."""
+
+    session: Session
+    title: str
+    rows: list[robot_rows.Row]  # all robots, shown or not
+    columns: tuple[str, ...] = ()  # roles in a column each; without any, there is one grid
+    noun: str = "robot"  # what a row shows: a robot, or a part of the library
+    thumbnails: dict[str, str] = field(default_factory=dict)  # thumbnails drawn so far, by URI
+    faults: dict[str, str] = field(default_factory=dict)  # errors of unreadable robots, by URI
+    controls: dict[str, Any] = field(default_factory=dict)  # controls by their key in the address
+    histograms: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
+    """Distributions of the facts above their sliders."""
+    notices: list[str] = field(default_factory=list)
+    """Messages about values of the address that were left out; cleared when a control changes."""
+    empty: str = ""  # HTML in place of the cards if no robot passes the filter
+    grid: viser.GuiHtmlHandle | None = None
+    summary: str = ""  # number of robots that pass the filter, and of the page
+    page_rows: list[robot_rows.Row] = field(default_factory=list)  # robots on the current page
+    page_number: int = 1
+
+
+def card(row: robot_rows.Row, thumbnail: str, fault: str) -> str:
+    """Return a robot's card in the grid: a link to its page, and a check box that chooses it."""
+    image = f'<div class="picture"><img alt="" src="{thumbnail}"></div>'
+    if not thumbnail:
+        image = f'<div class="empty">{"broken" if fault else "…"}</div>'
+    tags = markup.tag(row.role, row.role) if row.role else ""
+    if row.task:
+        tags += markup.tag(row.task)
+    if row.findings:
+        tags += markup.tag(", ".join(row.findings[:2]), "error" if fault else "warning")
+    facts = robot_rows.facts_line(row) or escape(row.category)
+    if row.licence:
+        facts += f"<br>{escape(row.licence)}"
+    query = escape(Address("robot", (row.uri,)).query)
+    return (
+        f'<div class="cell"><a class="card" href="{query}" title="{escape(fault or row.uri)}" '
+        f'aria-keyshortcuts="Space">'
+        f'{image}<div class="text"><div class="name">{escape(row.name)}</div>'
+        f"{markup.dim(facts)}{tags}</div></a>{'' if fault else markup.choose_box(row.uri)}</div>"
+    )
+
+
+def draw_cards(gallery: Gallery) -> None:
+    """Draw the cards of the current page, in a column for each role if there are columns."""
+    if gallery.grid is None:
+        return
+    columns: dict[str, list[str]] = {role: [] for role in gallery.columns}
+    for row in gallery.page_rows:
+        thumbnail, fault = gallery.thumbnails.get(row.uri, ""), gallery.faults.get(row.uri, "")
+        role = row.role if gallery.columns else ""
+        columns.setdefault(role, []).append(card(row, thumbnail, fault))
+    html = [
+        f"<div>{f'<h3>{role} ({len(cards)})</h3>' if role else ''}"
+        f'<div class="grid">{"".join(cards)}</div></div>'
+        for role, cards in columns.items()
+    ]
+    summary = f'<div class="dim" style="padding:.6em 0">{gallery.summary}</div>'
+    content = f'<div class="columns">{"".join(html)}</div>' if gallery.page_rows else gallery.empty
+    notices = [
+        f"<div>{markup.tag('address', 'warning')} {escape(notice)}</div>"
+        for notice in gallery.notices
+    ]
+    shown = markup.framed(*notices, summary, content)
+    if gallery.session.width > NARROW:
+        gallery.grid.content = shown
+    else:
+        gallery.session.run_script(call("cards", shown))
+
+
+_ALL = "all"
+_LABELS = {"dof": "DoF", "links": "Links", "reach": "Reach (m)", "mass": "Mass (kg)"}
+_COUNTS = ("dof", "links")  # facts that are integers
+_SORTS = [key for name in robot_rows.SORTS for key in (name, f"-{name}")]
+"""Keys of the orders: ascending and descending."""
+
+
+def add_filter(gallery: Gallery) -> None:
+    """Add the controls in the state that the address gives; note values that it cannot have."""
+    session, gui = gallery.session, gallery.session.client.gui
+    gallery.controls["search"] = gui.add_text("Search", "")
+    bind(session, "search", gallery.controls["search"])
+    _add_dropdown(gallery, "sort", "Sort by", _SORTS)
+    is_filtered = not session.address.state.keys().isdisjoint({*FILTERS[1:], "size"})
+    with gui.add_folder("Filter", expand_by_default=is_filtered):
+        for key in WORDS_OF_ROWS:
+            choices = (_ALL, *robot_rows.fact_choices(gallery.rows, key))
+            label = _role_name(gallery) if key == "role" else key
+            _add_dropdown(gallery, key, label.capitalize(), choices)
+        _add_dropdown(gallery, "findings", "Findings", (_ALL, "with", "without"))
+        for fact in robot_rows.NUMBERS:
+            _add_range(gallery, fact)
+        _add_dropdown(gallery, "size", "On a page", tuple(map(str, robot_rows.PAGE_SIZES)))
+
+
+def passing_rows(gallery: Gallery) -> list[robot_rows.Row]:
+    """Return the robots that pass the filter, on all pages, in the order of the set."""
+    state = gallery.session.state()
+    return robot_rows.sort_rows((row for row in gallery.rows if passes(row, state)), "order")
+
+
+def clear_filter(gallery: Gallery, key: str) -> None:
+    """Let every robot pass a condition of the filter, or all conditions without a key."""
+    for name in (key,) if key else FILTERS:
+        if (control := gallery.controls.get(name)) is None:
+            continue
+        if name in robot_rows.NUMBERS:
+            control.value = (control.min, control.max)
+        else:
+            control.value = "" if name == "search" else _ALL
+
+
+def empty_text(gallery: Gallery) -> str:
+    """Return what excludes all robots, as HTML with links that clear each condition."""
+    lines = []
+    for key, value in gallery.session.state().items():
+        if key not in FILTERS or not value:
+            continue
+        alone = sum(passes(row, {key: value}) for row in gallery.rows)
+        count = "no robot" if not alone else "1 robot" if alone == 1 else f"{alone} robots"
+        name = _LABELS.get(key, key)
+        clear = f'<a data-do="clear filter" data-value="{key}">clear</a>'
+        lines.append((escape(f"{name}: {value}"), f"{count} of {len(gallery.rows)}", clear))
+    table = markup.table(("condition", "passed by", ""), lines)
+    clear = '<a data-do="clear filter" data-value="">clear all</a>'
+    return f"<h3>No robot passes the filter</h3>{table}<p>{clear}</p>"
+
+
+def show_histograms(gallery: Gallery) -> None:
+    """Show how many robots have each value of a fact; those that the slider lets pass stand out."""
+    for fact, handle in gallery.histograms.items():
+        values = [float(v) for row in gallery.rows if (v := getattr(row, fact)) is not None]
+        control = gallery.controls[fact]
+        low, high = control.value
+        svg = figures.histogram_svg(values, (control.min, control.max), (low, high))
+        handle.content = markup.framed(f'<div class="histogram">{svg}</div>')
+
+
+def parse_range(
+    fact: str, text: str, limits: tuple[float, float] | None
+) -> tuple[float, float] | None:
+    """Parse ``LOW..HIGH`` of an address."""
+    if not text:
+        return limits
+    first, dots, last = text.partition("..")
+    try:
+        low, high = float(first), float(last if dots else "")
+    except ValueError:
+        low, high = 1.0, 0.0
+    where = f"{fact}={text[:40]}"
+    if not low <= high:
+        raise AddressError(f"{where} is no range, so it was left out; expected LOW..HIGH")
+    if limits is None:
+        raise AddressError(f"{where} was left out: no robot here has a known {fact}")
+    if low > limits[1] + robot_rows.ROUNDING or high < limits[0] - robot_rows.ROUNDING:
+        ends = " to ".join(dict.fromkeys(f"{end:.4g}" for end in limits))
+        raise AddressError(
+            f"{where} excludes every robot, so it was left out: they have {ends} {UNITS[fact]}"
+        )
+    return max(low, limits[0]), min(high, limits[1])
+
+
+def _add_dropdown(gallery: Gallery, key: str, label: str, keys: Collection[str]) -> None:
+    """Add a dropdown if there is a choice; the first is the default."""
+    session, value = gallery.session, gallery.session.address.state.get(key, "")
+    if value and value not in keys:
+        valid = ", ".join(list(keys)[:12]) + (", ..." if len(keys) > 12 else "")
+        gallery.notices.append(f"{key}={value[:40]} was left out; expected {valid}")
+        session.address = session.address.with_state(**{key: ""})
+    labels = [_sort_label(gallery, k) for k in keys] if key == "sort" else keys
+    if len(keys) > 1:
+        gallery.controls[key] = session.client.gui.add_dropdown(label, tuple(labels))
+        bind(session, key, gallery.controls[key], tuple(keys))
+
+
+def _role_name(gallery: Gallery) -> str:
+    """Return what the roles of rows are: kinds of parts, or sides of a split."""
+    return "kind of part" if gallery.noun == "part" else "side"
+
+
+def _sort_label(gallery: Gallery, key: str) -> str:
+    """Return the text of an order, such as ``reach, largest first``."""
+    name = key.removeprefix("-")
+    last = {"order": "last first"} | dict.fromkeys(("name", *WORDS_OF_ROWS), "Z to A")
+    text = _role_name(gallery) if name == "role" else name
+    return f"{text}, {last.get(name, 'largest first')}" if key != name else text
+
+
+def _add_range(gallery: Gallery, fact: str) -> None:
+    """Add a slider with two ends for a fact that varies."""
+    session, gui = gallery.session, gallery.session.client.gui
+    limits = robot_rows.fact_range(gallery.rows, fact)
+    try:
+        ends = parse_range(fact, session.address.state.get(fact, ""), limits)
+    except AddressError as error:
+        gallery.notices.append(str(error))
+        ends = limits
+    if limits is None or ends is None or limits[0] == limits[1]:
+        return
+    step = 1.0 if fact in _COUNTS else 0.001
+    low, high = limits[0] - limits[0] % step, limits[1] + (-limits[1]) % step
+    initial = (low if ends[0] == limits[0] else ends[0], high if ends[1] == limits[1] else ends[1])
+    gallery.histograms[fact] = gui.add_html("")
+    slider = gallery.controls[fact] = gui.add_multi_slider(_LABELS[fact], low, high, step, initial)
+
+    def write() -> str:
+        """Return the range for the address; empty if it lets every known value pass."""
+        low, high = slider.value
+        known = robot_rows.fact_range(gallery.rows, fact) or limits
+        return "" if low <= known[0] and high >= known[1] else f"{low:g}..{high:g}"
+
+    session.keep(fact, write)
+
+
+REFRESH_INTERVAL = 0.6  # time after which a gallery shows the thumbnails drawn meanwhile [s]
+
+
+def load_bundle_pictures(gallery: Gallery, rows: Iterable[Row]) -> None:
+    """Load the pictures that bundles have, for robots whose facts are known."""
+    for row in rows:
+        if row.uri in gallery.thumbnails or ":" in row.uri:
+            continue
+        path = gallery.session.files.path(row.uri) / PICTURE
+        thumbnail = thumbnail_of_picture(path) if path.is_file() else ""
+        if thumbnail and row.dof is not None:
+            gallery.thumbnails[row.uri] = thumbnail
+
+
+def load_pictures(
+    gallery: Gallery, rows: Sequence[Row], is_wanted: Callable[[], bool] = lambda: True
+) -> None:
+    """Load or draw the pictures that rows lack while they are wanted.
+
+    If a worker dies, they are requested once more.
+    """
+    load_bundle_pictures(gallery, rows)
+    try:
+        _request_missing(gallery, rows, is_wanted)
+    except WorkerDied:
+        gallery.session.notify("A worker died", "another one continues with the thumbnails")
+        _request_missing(gallery, rows, is_wanted)
+
+
+def _request_missing(gallery: Gallery, rows: Sequence[Row], is_wanted: Callable[[], bool]) -> None:
+    """Draw missing thumbnails in the workers, and show them as they arrive."""
+    session, workers = gallery.session, gallery.session.workers
+    pending = {}
+    for row in rows:
+        if row.uri not in gallery.faults and row.uri not in gallery.thumbnails:
+            pending[row.uri] = workers.submit(make_thumbnail, row.uri, session.files)
+    total = len(pending)
+    while pending and not session.closed.is_set() and is_wanted():
+        session.set_status(f"drawing {total} robots", (total - len(pending)) / total)
+        wait(pending.values(), timeout=REFRESH_INTERVAL, return_when=FIRST_COMPLETED)
+        for uri in [uri for uri, future in pending.items() if future.done()]:
+            _store_thumbnail(gallery, uri, workers.result(pending.pop(uri)))
+        draw_cards(gallery)
+    for future in pending.values():
+        future.cancel()
+    session.set_status("")
+
+
+def _store_thumbnail(gallery: Gallery, uri: str, thumbnail: Thumbnail) -> None:
+    if thumbnail.error:
+        gallery.faults[uri] = thumbnail.error
+    elif thumbnail.image:
+        gallery.thumbnails[uri] = thumbnail.image
+    facts: dict[str, Any] = thumbnail.facts
+    for rows in (gallery.rows, gallery.page_rows):
+        rows[:] = [_completed(row, facts) if row.uri == uri else row for row in rows]
+
+
+def _completed(row: Row, facts: Mapping[str, Any]) -> Row:
+    """Return a row with the facts that it lacks, and with the findings of the robot itself."""
+    return replace(
+        row, **{k: v for k, v in facts.items() if k == "findings" or getattr(row, k) is None}
+    )
+
+
+CONTROLS_WIDTH = 330.0  # width of the controls [pixels]
+CANVAS_WIDTH = 120.0  # width that viser keeps free for its scene between the panels [pixels]
+MIN_WIDTH = 240.0  # width of the panel of cards at least [pixels]
+NARROW = 576  # width of a window below which viser has one panel, at the bottom [pixels]
+_PAGE_BUTTONS: Mapping[str, Callable[[int], int]] = {
+    "first": lambda number: 1,
+    "prev": lambda number: number - 1,
+    "next": lambda number: number + 1,
+    "last": lambda number: 10**9,  # clipped to the last page
+}
+
+
+def open_panels(
+    gallery: Gallery, breadcrumbs: str, header: str, width: float = CONTROLS_WIDTH
+) -> viser.PanelHandle:
+    """Open the panel of controls at the right, and return that of thumbnails at the left."""
+    client = gallery.session.client
+    gui = client.gui
+    # The open panel of cards lies over the strip that viser keeps free for its scene.
+    left = '[data-dock-region="left"]:not(:has([data-dock-column-rail]))'
+    cover = (
+        f"<style>{left}{{width:calc(100% - {width}px)!important}}"
+        f"{left} :has(>[data-dock-column]){{width:100%!important}}</style>"
+    )
+    gallery.session.open_panel(width, breadcrumbs + markup.framed(header) + cover)
+    panel = gui.add_panel()
+    with panel.add_tab(gallery.title, viser.Icon.LAYOUT_GRID):
+        gallery.grid = gui.add_html("")
+    panel.dock_left()
+    panel.set_width(max(gallery.session.width - width - CANVAS_WIDTH, MIN_WIDTH))
+    panel.visible = gallery.session.width > NARROW
+    return panel
+
+
+def add_controls(gallery: Gallery) -> None:
+    """Add the controls, in the state that the address gives, and show the first robots."""
+    session = gallery.session
+    add_filter(gallery)
+    session.keep("n", lambda: "" if gallery.page_number == 1 else str(gallery.page_number))
+    gallery.page_number = parse_count(session.address.state.get("n", ""), 1)
+    session.title = gallery.title
+    session.apply_state()
+    buttons = session.client.gui.add_button_group("Page", tuple(_PAGE_BUTTONS))
+
+    def turn_page() -> None:
+        show_page(gallery, _PAGE_BUTTONS[buttons.value](gallery.page_number))
+
+    def changed() -> None:
+        gallery.notices.clear()
+        show_page(gallery, 1)
+
+    def clear(key: str) -> None:
+        clear_filter(gallery, key)
+        changed()
+
+    for control in gallery.controls.values():
+        session.on_change(control, changed, "filter")
+    session.on_change(buttons, turn_page)
+    session.actions["clear filter"] = clear
+    show_page(gallery, gallery.page_number)
+
+
+def show_page(gallery: Gallery, number: int) -> None:
+    """Show a page of the robots that pass the filter, and request missing thumbnails."""
+    session, size = gallery.session, int(gallery.controls["size"].value)
+    rows = robot_rows.sort_rows(passing_rows(gallery), session.state().get("sort") or "order")
+    gallery.page_rows, gallery.page_number, count = robot_rows.select_page(rows, number, size)
+    session.show_state()
+    total = "" if len(rows) == len(gallery.rows) else f" of {len(gallery.rows)}"
+    noun = gallery.noun if len(gallery.rows) == 1 else f"{gallery.noun}s"
+    gallery.summary = f"{len(rows)}{total} {noun} · page {gallery.page_number} of {count}"
+    gallery.empty = "" if rows else empty_text(gallery)
+    load_bundle_pictures(gallery, gallery.page_rows)
+    show_histograms(gallery)
+    draw_cards(gallery)
+
+    def draw_missing() -> None:
+        """Draw what the page lacks while it is the current one; other thumbnails can wait."""
+        shown = gallery.page_rows
+        load_pictures(gallery, shown, lambda: gallery.page_rows is shown)
+
+    session.run_in_background(draw_missing, "thumbnails")
+
 
 _COMPOSE = Address("compose", (DEFAULT_WORDS,))
 INTRODUCTION = (

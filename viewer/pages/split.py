@@ -15,8 +15,14 @@ from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address
 from morphgen.viewer.app.session import Session
 from morphgen.viewer.figures import heatmap_svg, map_svg
-from morphgen.viewer.gallery import Gallery, add_controls, load_pictures, open_panels, passing_rows
-from morphgen.viewer.pages.gallery import show_index
+from morphgen.viewer.pages.gallery import (
+    Gallery,
+    add_controls,
+    load_pictures,
+    open_panels,
+    passing_rows,
+    show_index,
+)
 from morphgen.viewer.robot_rows import split_rows
 from morphgen.viewer.robot_uri import member_uri, resolve_member, resolve_split
 from morphgen.viewer.splits import SAVED_REGIMES, Sides, SplitStudy, add_save_form, study_split
