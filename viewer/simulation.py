@@ -27,15 +27,8 @@ from morphgen.rl.baselines import BASELINES, Controller
 from morphgen.rl.demonstrations.lerobot import BODIES, INFO
 from morphgen.rl.demonstrations.reader import Demonstrations
 from morphgen.rl.inference import ControllerSpec, make_env_and_controller, read_controller
+from morphgen.rl.runs import robot_source
 from morphgen.rl.runs.checkpoint import read_checkpoint
-from morphgen.rl.runs.robot_source import (
-    FILE,
-    GrammarSource,
-    OneRobot,
-    members,
-    read_drawn,
-    tasks_of,
-)
 from morphgen.rl.shipped_policies import is_named, policies_for
 from morphgen.tasks.batch import BeforePhysics, TaskBatch
 from morphgen.tasks.gym.env import TaskEnv
@@ -125,16 +118,16 @@ def training_robots(policy: str, files: FileAccess) -> tuple[str, bool, list[tup
     """
     path = checkpoint_path(policy, BASELINES, files)
     source = read_checkpoint(path)[0].source
-    rows = members(source)
-    if isinstance(source, GrammarSource):
+    rows = robot_source.members(source)
+    if isinstance(source, robot_source.GrammarSource):
         folder = path if path.is_dir() else path.parent
-        rows = read_drawn(folder) if (folder / FILE).is_file() else ()
+        rows = robot_source.read_drawn(folder) if (folder / robot_source.FILE).is_file() else ()
         if not rows:
-            return tasks_of(source)[0], source.obstacles, []
+            return robot_source.tasks_of(source)[0], source.obstacles, []
     if rows:
         robots = [(row.name, f"{DERIVATION}{row.derivation}") for row in rows]
         return rows[0].task, any(row.obstacles for row in rows), robots
-    assert isinstance(source, OneRobot)  # splits and grammars have members
+    assert isinstance(source, robot_source.OneRobot)  # splits and grammars have members
     # The name comes from a file, so paths in it are read only through ``files``.
     words = source.name.split()
     if is_robot_file(source.name):

@@ -8,16 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from morphgen.benchmark.licences import (
-    CROISSANT_FILE,
-    LicencedPart,
-    croissant_contents,
-    croissant_head,
-    dataset_card,
-    find_licence,
-    licence_addresses,
-    licence_files,
-)
+from morphgen.benchmark import licences
 from morphgen.benchmark.split_folder import README_FILE, SUMS_FILE, read_sums, sums_text
 from morphgen.benchmark.texts import read_text
 from morphgen.files import write_atomic
@@ -103,14 +94,14 @@ def describe(demos: Demonstrations) -> None:
     if (folder / SUMS_FILE).is_file():
         return
     parts = _licenced_parts(folder)
-    texts = {**licence_files(parts), README_FILE: _card(demos, parts)}
+    texts = {**licences.licence_files(parts), README_FILE: _card(demos, parts)}
     for name, text in texts.items():
         write_atomic(folder / name, text)
-    write_atomic(folder / CROISSANT_FILE, _croissant(demos, parts, folder_hashes(folder)))
+    write_atomic(folder / licences.CROISSANT_FILE, _croissant(demos, parts, folder_hashes(folder)))
     write_atomic(folder / SUMS_FILE, sums_text(_sums(folder)))
 
 
-def _licenced_parts(folder: Path) -> tuple[LicencedPart, ...]:
+def _licenced_parts(folder: Path) -> tuple[licences.LicencedPart, ...]:
     """Return the parts of all robots with their licences, sorted by licence and name."""
     robots: dict[tuple[str, str, str], dict[tuple[str, str], None]] = {}
     for body in read_index(folder):
@@ -119,13 +110,13 @@ def _licenced_parts(folder: Path) -> tuple[LicencedPart, ...]:
             key = part["part"], part.get("licence", "unknown"), part.get("citation", "")
             robots.setdefault(key, {})["train", body["name"]] = None
     found = [
-        LicencedPart(name, find_licence(licence), citation, (*who,))
+        licences.LicencedPart(name, licences.find_licence(licence), citation, (*who,))
         for (name, licence, citation), who in robots.items()
     ]
     return tuple(sorted(found, key=lambda each: (each.licence.id, each.part)))
 
 
-def _card(demos: Demonstrations, parts: Sequence[LicencedPart]) -> str:
+def _card(demos: Demonstrations, parts: Sequence[licences.LicencedPart]) -> str:
     """Return the dataset card, with the front matter that Hugging Face and LeRobot read."""
     settings, name = demos.settings, demos.folder.resolve().name
     tasks = [each.task for each in summarize(demos)]
@@ -136,7 +127,7 @@ def _card(demos: Demonstrations, parts: Sequence[LicencedPart]) -> str:
         "configs": [{"config_name": "default", "data_files": data_files}],
     }
     noise = f"`executed_action` is what the robot did, with noise of {settings['noise']:g}."
-    return dataset_card(
+    return licences.dataset_card(
         name,
         parts,
         front,
@@ -157,10 +148,12 @@ def _card(demos: Demonstrations, parts: Sequence[LicencedPart]) -> str:
 
 
 def _croissant(
-    demos: Demonstrations, parts: Sequence[LicencedPart], sums: Mapping[str, str]
+    demos: Demonstrations, parts: Sequence[licences.LicencedPart], sums: Mapping[str, str]
 ) -> str:
     """Return the text of ``croissant.json``, with the provenance of the data in terms of PROV-O."""
-    data = croissant_head() | croissant_contents("demonstrations_croissant.json", sums)
+    data = licences.croissant_head() | licences.croissant_contents(
+        "demonstrations_croissant.json", sums
+    )
     data["@context"] |= {"prov": "http://www.w3.org/ns/prov#"}
     info, settings = read_json(demos.folder / INFO), demos.settings
     name = demos.folder.resolve().name
@@ -169,7 +162,7 @@ def _croissant(
         "description": f"{len(demos.episodes)} episodes of {len(demos.robot_hashes)} robots with "
         "the robots that they show, for cross-embodiment imitation learning",
         "version": "1.0.0",
-        "license": licence_addresses(parts),
+        "license": licences.licence_addresses(parts),
         "citeAs": f"{name}: demonstrations recorded with morphgen {settings['morphgen']}",
         "prov:wasGeneratedBy": {
             "@type": "prov:Activity",

@@ -31,19 +31,9 @@ from typing import Any
 
 import msgspec
 
+from morphgen.benchmark import licences
+from morphgen.benchmark import survey as surveys
 from morphgen.benchmark.audit import Audit, audit_survey
-from morphgen.benchmark.licences import (
-    CROISSANT_FILE,
-    LICENCES_FILE,
-    LicencedPart,
-    croissant_contents,
-    croissant_head,
-    dataset_card,
-    licence_addresses,
-    licence_files,
-    licenced_parts,
-    require_allowed,
-)
 from morphgen.benchmark.scores.submission import EvalProtocol, tasks_of_split
 from morphgen.benchmark.split_folder import (
     BUNDLED,
@@ -64,23 +54,6 @@ from morphgen.benchmark.split_folder import (
     split_folder_path,
     sums_text,
     writing_split,
-)
-from morphgen.benchmark.survey import (
-    DIGITS,
-    STRUCTURAL,
-    BaselineResults,
-    RobotDifficulty,
-    SplitSurvey,
-    compare_members,
-    different_members,
-    difficulty_cells,
-    difficulty_csv,
-    difficulty_table,
-    nearest_column,
-    summarize_survey,
-    survey_difficulty,
-    survey_split,
-    train_similarity,
 )
 from morphgen.benchmark.texts import read_text
 from morphgen.encoding.similarity import MEASURES
@@ -213,15 +186,15 @@ def opened_folder(path: Path) -> Iterator[Path]:
 
 
 def croissant_text(
-    split: Split, release: Release, parts: Sequence[LicencedPart], sums: Mapping[str, str]
+    split: Split, release: Release, parts: Sequence[licences.LicencedPart], sums: Mapping[str, str]
 ) -> str:
     """Return the text of ``croissant.json``."""
-    data = croissant_head() | {
+    data = licences.croissant_head() | {
         "name": release.stem,
         "description": f"{split.summary}. A split of robots for cross-embodiment learning: "
         f"{len(split.train)} robots to train on, {len(split.test)} to test on.",
         "version": release.version,
-        "license": licence_addresses(parts),
+        "license": licences.licence_addresses(parts),
         "citeAs": citation(split, release),
     }
     if release.date:
@@ -231,7 +204,7 @@ def croissant_text(
     if release.creators:
         people = [{"@type": "sc:Organization", "name": name} for name in release.creators]
         data["creator"] = people
-    data |= croissant_contents("release_croissant.json", sums)
+    data |= licences.croissant_contents("release_croissant.json", sums)
     return json.dumps(data, indent=2, ensure_ascii=False) + "\n"
 
 
@@ -255,9 +228,9 @@ _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 def card_text(
     split: Split,
     release: Release,
-    parts: Sequence[LicencedPart],
+    parts: Sequence[licences.LicencedPart],
     names: Iterable[str],
-    rows: Sequence[RobotDifficulty],
+    rows: Sequence[surveys.RobotDifficulty],
 ) -> str:
     """Return the dataset card.
 
@@ -280,7 +253,7 @@ def card_text(
             {"config_name": "robots", "data_files": [{"split": "robots", "path": ROBOTS_FILE}]}
         ],
     }
-    return dataset_card(
+    return licences.dataset_card(
         f"{release.name} {release.version}",
         parts,
         front,
@@ -300,7 +273,7 @@ def card_text(
     )
 
 
-def _difficulty(release: Release, rows: Sequence[RobotDifficulty]) -> str:
+def _difficulty(release: Release, rows: Sequence[surveys.RobotDifficulty]) -> str:
     cosine = release.difficulty["cosine"]
     low, high = cosine["min"], cosine["max"]
     test = [row for row in rows if row.side == "test"]
@@ -311,7 +284,7 @@ def _difficulty(release: Release, rows: Sequence[RobotDifficulty]) -> str:
         f"Cosine similarity of test and train robots: {cosine['mean']:.2f} (from {low:.2f} to "
         f"{high:.2f}). `{DIFFICULTY_FILE}` has a row per robot, train robots too.{more} Nearest: "
         f"the most similar train robot and its value by each measure{scores}.\n\n"
-        f"{difficulty_table(test[:MAX_ROWS], baselines, 'github')}"
+        f"{surveys.difficulty_table(test[:MAX_ROWS], baselines, 'github')}"
     )
 
 
@@ -398,16 +371,16 @@ class CheckedRelease:
     """A split that may be released as requested, with what the checks found out."""
 
     release: Release
-    parts: tuple[LicencedPart, ...]
-    survey: SplitSurvey
+    parts: tuple[licences.LicencedPart, ...]
+    survey: surveys.SplitSurvey
 
 
 def require_releasable(
     split: Split, library: Library, request: ReleaseRequest
-) -> tuple[LicencedPart, ...]:
+) -> tuple[licences.LicencedPart, ...]:
     """Require valid names and allowed licences of a release; return the parts of its robots."""
-    parts = licenced_parts(split, library)
-    require_allowed(split, parts, request.allowed_licences)
+    parts = licences.licenced_parts(split, library)
+    licences.require_allowed(split, parts, request.allowed_licences)
     _release(split, request, {})
     return tuple(parts)
 
@@ -417,7 +390,7 @@ def check_release(
 ) -> CheckedRelease:
     """Require that a split may be released: names, licences of its parts, and audit."""
     parts = require_releasable(split, library, request)
-    survey = survey_split(split, library, pairs="train", jobs=jobs)
+    survey = surveys.survey_split(split, library, pairs="train", jobs=jobs)
     audited = audit_survey(survey, library)
     require_passed(audited)
     release = _release(split, request, _difficulty_data(survey, audited))
@@ -436,13 +409,13 @@ def release_split(
     request: ReleaseRequest,
     *,
     extra: Mapping[str, bytes] | None = None,
-    results: BaselineResults | None = None,
+    results: surveys.BaselineResults | None = None,
     jobs: int = 1,
 ) -> ReleaseReport:
     """Write the archive of a release into a folder."""
     checked = check_release(split, library, request, jobs=jobs)
     release, parts = checked.release, checked.parts
-    rows = survey_difficulty(checked.survey, results)
+    rows = surveys.survey_difficulty(checked.survey, results)
     goals: list[GoalResult] = []
     if request.goals:
         goals = sample_split_goals(split, library, request.protocol.goals, jobs=jobs)
@@ -460,8 +433,8 @@ def release_split(
         )
         texts = {
             RELEASE_FILE: release_text(release),
-            **licence_files(parts),
-            DIFFICULTY_FILE: difficulty_csv(rows, tuple(results or ())),
+            **licences.licence_files(parts),
+            DIFFICULTY_FILE: surveys.difficulty_csv(rows, tuple(results or ())),
         }
         files = {name: text.encode() for name, text in texts.items()} | dict(extra or {})
         known = [*read_sums(report.folder / SUMS_FILE), *files]
@@ -469,7 +442,7 @@ def release_split(
         _add_files(report.folder, files)
         sums = read_sums(report.folder / SUMS_FILE)
         croissant = croissant_text(split, release, parts, sums)
-        _add_files(report.folder, {CROISSANT_FILE: croissant.encode()})
+        _add_files(report.folder, {licences.CROISSANT_FILE: croissant.encode()})
         return _write_archive(report.folder, out, release)
 
 
@@ -498,16 +471,16 @@ def _release(split: Split, request: ReleaseRequest, difficulty: Mapping[str, Any
     return read_record(data, Release, "release", BenchmarkError)
 
 
-def _difficulty_data(survey: SplitSurvey, audited: Audit) -> dict[str, Any]:
+def _difficulty_data(survey: surveys.SplitSurvey, audited: Audit) -> dict[str, Any]:
     """Return the similarity of test and train robots as JSON data."""
     nearest = {
         test: {
-            measure: {"train": found.train, "value": round(found.value, DIGITS)}
+            measure: {"train": found.train, "value": round(found.value, surveys.DIGITS)}
             for measure, found in trains.items()
         }
         for test, trains in audited.nearest.items()
     }
-    return {"cosine": summarize_survey(survey)["cosine"], "nearest": nearest}
+    return {"cosine": surveys.summarize_survey(survey)["cosine"], "nearest": nearest}
 
 
 def _add_files(folder: Path, files: Mapping[str, bytes]) -> None:
@@ -540,7 +513,7 @@ def _write_archive(folder: Path, out: Path, release: Release) -> ReleaseReport:
 
 _MAX_SHOWN = 100  # largest number of characters of a cell in a message
 _NUMBERS = ("reach", *MEASURES)  # columns that are compared with `FITTED_TOLERANCE`
-_NEAREST = {nearest_column(name): name for name in MEASURES}
+_NEAREST = {surveys.nearest_column(name): name for name in MEASURES}
 """Measure by the column of its nearest train robot."""
 
 
@@ -551,9 +524,11 @@ def _release_differences(folder: Path, split: Split, library: Library) -> Iterat
         if (release.name, release.id) != (split.name, split_id(split)):
             why = f"it is of split {release.name}, id {release.id}, not of {SPLIT_FILE}"
             yield Difference(RELEASE_FILE, why)
-        expected = [part.as_dict() for part in licenced_parts(split, library)]
-        if _without_sources(read_json(folder / LICENCES_FILE)) != _without_sources(expected):
-            yield Difference(LICENCES_FILE, "its licences are not those of the parts")
+        expected = [part.as_dict() for part in licences.licenced_parts(split, library)]
+        if _without_sources(read_json(folder / licences.LICENCES_FILE)) != _without_sources(
+            expected
+        ):
+            yield Difference(licences.LICENCES_FILE, "its licences are not those of the parts")
     except MorphgenError as error:
         yield Difference(RELEASE_FILE, str(error))
 
@@ -567,17 +542,17 @@ def _without_sources(parts: Any) -> list[Any]:  # noqa: ANN401
     ]
 
 
-def _difficulty_differences(path: Path, survey: SplitSurvey) -> Iterator[str]:
+def _difficulty_differences(path: Path, survey: surveys.SplitSurvey) -> Iterator[str]:
     """Yield how the structural columns of ``difficulty.csv`` differ from those of a survey."""
     try:
         header, *lines = csv.reader(read_data_text(path).splitlines() or [""])
     except (MorphgenError, csv.Error) as error:
         yield f"cannot be read: {error}"
         return
-    if tuple(header[: len(STRUCTURAL)]) != STRUCTURAL:
-        yield f"it has other columns; expected {', '.join(STRUCTURAL)}"
+    if tuple(header[: len(surveys.STRUCTURAL)]) != surveys.STRUCTURAL:
+        yield f"it has other columns; expected {', '.join(surveys.STRUCTURAL)}"
         return
-    rows = survey_difficulty(survey)
+    rows = surveys.survey_difficulty(survey)
     if len(lines) != len(rows):
         yield f"it has {len(lines)} robots, not {len(rows)}"
         return
@@ -587,17 +562,17 @@ def _difficulty_differences(path: Path, survey: SplitSurvey) -> Iterator[str]:
             yield f"line {i + 2} has {len(cells)} cells, not {len(header)}"
             continue
         line = dict(zip(header, cells, strict=True))
-        similarity = dict(zip(names, train_similarity(survey, i), strict=True))
+        similarity = dict(zip(names, surveys.train_similarity(survey, i), strict=True))
         for why in _row_differences(line, row, similarity):
             yield f"line {i + 2}: {why}"
 
 
 def _row_differences(
-    line: Mapping[str, str], row: RobotDifficulty, similarity: Mapping[str, Array]
+    line: Mapping[str, str], row: surveys.RobotDifficulty, similarity: Mapping[str, Array]
 ) -> Iterator[str]:
     """Yield how a line differs from a robot's row, given its similarity to every train robot."""
-    cells = difficulty_cells(row)
-    for column in STRUCTURAL:
+    cells = surveys.difficulty_cells(row)
+    for column in surveys.STRUCTURAL:
         found, expected = line[column], cells.get(column, "")
         if found == expected:
             continue
@@ -655,8 +630,8 @@ def verify(name_or_path: str | Path, library: Library, *, jobs: int = 1) -> Veri
         return Verification(split, computed_id, tuple(differences))
     differences += _release_differences(folder, split, library)
     if has_difficulty and robots:
-        known = [robots[member.robot_hash] for member in different_members(split)]
-        survey = compare_members(split, known, "train", jobs=jobs)
+        known = [robots[member.robot_hash] for member in surveys.different_members(split)]
+        survey = surveys.compare_members(split, known, "train", jobs=jobs)
         faults = _difficulty_differences(difficulty, survey)
         differences += [Difference(DIFFICULTY_FILE, why) for why in faults]
     content = file_sha256(folder / SUMS_FILE)

@@ -46,18 +46,7 @@ from morphgen.encoding.tokens import (
 )
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError
 from morphgen.files import file_sha256, write_atomic
-from morphgen.formats import records
-from morphgen.formats.bundle import (
-    CARD,
-    PICTURE,
-    URDF,
-    bundle_folder,
-    card_text,
-    file_findings,
-    robot_card,
-    split_colours,
-    write_bundle,
-)
+from morphgen.formats import bundle, records
 from morphgen.formats.data_files import parse_json, read_json, read_text
 from morphgen.formats.files import begin_folder, folder_hashes, locked_folder
 from morphgen.formats.urdf.write import urdf_text
@@ -332,22 +321,24 @@ def _light_differences(folder: Path, robot: Robot) -> Iterator[str]:
 
 def _differences(folder: Path, robot: Robot) -> Iterator[str]:
     try:
-        findings = file_findings(folder)
+        findings = bundle.file_findings(folder)
     except FormatError as error:
         yield str(error)
         return
     yield from (f"{finding.where}: {finding.why}" for finding in findings)
-    card = read_json(folder / CARD)
-    if (folder / URDF).is_file():
-        stored_urdf = (folder / URDF).read_text("utf-8", "replace")
+    card = read_json(folder / bundle.CARD)
+    if (folder / bundle.URDF).is_file():
+        stored_urdf = (folder / bundle.URDF).read_text("utf-8", "replace")
         # Compared without the names of meshes, which depend on where the meshes are stored.
-        if _MESH.sub(r'\1"', stored_urdf) != urdf_text(split_colours(robot), lambda mesh: ""):
-            yield f"file {URDF} is not the robot's"
-    expected = json.loads(card_text(robot_card(robot, (), card["hashes"], {})))
+        if _MESH.sub(r'\1"', stored_urdf) != urdf_text(
+            bundle.split_colours(robot), lambda mesh: ""
+        ):
+            yield f"file {bundle.URDF} is not the robot's"
+    expected = json.loads(bundle.card_text(bundle.robot_card(robot, (), card["hashes"], {})))
     for key in sorted(expected.keys() - _IGNORED_KEYS):
         if not same(card.get(key), expected[key]):
-            yield f"file {CARD}: its {key!r} is not the robot's"
-    yield from _extra(folder, (*card["hashes"], CARD, PICTURE))
+            yield f"file {bundle.CARD}: its {key!r} is not the robot's"
+    yield from _extra(folder, (*card["hashes"], bundle.CARD, bundle.PICTURE))
 
 
 def _extra(folder: Path, known: Iterable[str]) -> Iterator[str]:
@@ -410,7 +401,7 @@ def build_split(
 def split_folder_path(split: Split, folder: Path) -> Path:
     """Return the folder of a split in a parent folder."""
     for name in split.name.split("/"):
-        folder = bundle_folder(folder, name)
+        folder = bundle.bundle_folder(folder, name)
     return folder
 
 
@@ -424,16 +415,16 @@ def _write_member(
     """Write the folder of a member, unless an earlier build has; runs in worker processes."""
     robot = compose_member(member, library)
     require_max_links(len(robot.links), f"robot {member.name!r}", max_links)
-    folder = bundle_folder(split_folder / ROBOTS_DIR, member.name)
+    folder = bundle.bundle_folder(split_folder / ROBOTS_DIR, member.name)
     is_kept = not differences(folder, robot, light=settings.light)
     if is_kept and not settings.light:  # written in the same way by this version
-        versions = read_json(folder / CARD)["versions"]
-        has_picture = (folder / PICTURE).is_file()
+        versions = read_json(folder / bundle.CARD)["versions"]
+        has_picture = (folder / bundle.PICTURE).is_file()
         is_kept = versions == {"morphgen": version("morphgen")} and has_picture == settings.picture
     if not is_kept and settings.light:
         write_light(robot, folder)
     elif not is_kept:
-        write_bundle(robot, folder, check(robot), picture=settings.picture, edits_kept=False)
+        bundle.write_bundle(robot, folder, check(robot), picture=settings.picture, edits_kept=False)
     measured = measure_robot(robot, library, max_links, with_features=False)
     return not is_kept, measured, folder_hashes(folder)
 

@@ -15,6 +15,7 @@ from morphgen.api.splits import DEFAULT_TRAIN, NewSplit
 from morphgen.api.splits import goals as sample_goals
 from morphgen.api.splits import split as open_split
 from morphgen.benchmark import release as releases
+from morphgen.benchmark import split_folder, survey
 from morphgen.benchmark.audit import Audit
 from morphgen.benchmark.hold_out import related_parts
 from morphgen.benchmark.licences import (
@@ -22,18 +23,6 @@ from morphgen.benchmark.licences import (
     restricted,
     restriction_line,
     restriction_text,
-)
-from morphgen.benchmark.release import (
-    SUBMISSIONS_DIR,
-    ReleaseRequest,
-    archive_path,
-    build_with_goals,
-    check_release,
-    is_release,
-    opened_folder,
-    read_release,
-    release_split,
-    require_releasable,
 )
 from morphgen.benchmark.scores.results import (
     NOTE,
@@ -64,25 +53,7 @@ from morphgen.benchmark.scores.submission import (
     require_same_random,
     tasks_of_split,
 )
-from morphgen.benchmark.split_folder import (
-    SPLIT_FILE,
-    BuildSettings,
-    Difference,
-    is_archive,
-    read_split_or_folder,
-    require_unchanged,
-)
-from morphgen.benchmark.survey import (
-    PAPER_TABLE,
-    BaselineResults,
-    PaperRow,
-    RobotDifficulty,
-    difficulty_csv,
-    difficulty_table,
-    paper_row,
-    split_difficulty,
-    statistics,
-)
+from morphgen.benchmark.survey import paper_row, statistics
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, status
 from morphgen.encoding.similarity import MEASURES, NEAR_THRESHOLDS, NearThresholds
@@ -176,7 +147,7 @@ def _by_code(findings: Sequence[Finding]) -> dict[str, list[Finding]]:
     return {code: [each for each in findings if each.code == code] for code in codes}
 
 
-def _listed(findings: Sequence[Finding | Difference]) -> list[str]:
+def _listed(findings: Sequence[Finding | split_folder.Difference]) -> list[str]:
     """Return a line per finding, and how many more there are."""
     more = len(findings) - MAX_LISTED
     lines = [f"  {finding.where}: {finding.why}" for finding in findings[:MAX_LISTED]]
@@ -185,14 +156,16 @@ def _listed(findings: Sequence[Finding | Difference]) -> list[str]:
 
 def build(args: argparse.Namespace) -> None:
     """Build a split and print where it is."""
-    settings = BuildSettings(light=args.light, picture=args.picture)
+    settings = split_folder.BuildSettings(light=args.light, picture=args.picture)
     split, config = read_split(args.split), GoalConfig(args.goal_seed or 0)
     library, goals = opt.library_of(args), list[GoalResult]()
     if args.goals:
         with bar(args, "sampling goals"):
             goals = sample_split_goals(split, library, config, jobs=args.jobs)
     with bar(args, "building"):
-        report = build_with_goals(split, args.out, library, settings, goals, config, jobs=args.jobs)
+        report = releases.build_with_goals(
+            split, args.out, library, settings, goals, config, jobs=args.jobs
+        )
     written, kept = report.num_written, report.num_kept
     data: dict[str, object] = {"folder": str(report.folder), "made": written, "kept": kept}
     lines = [f"{report.folder}: {written} robots written, {kept} already existed"]
@@ -237,25 +210,25 @@ def difficulty(args: argparse.Namespace) -> None:
     if args.csv is not None:
         require_writable_file(args.csv, "--csv", ".csv")
     words: dict[str, str] = {}
-    splits = [read_split_or_folder(name)[0] for name in args.splits]
+    splits = [split_folder.read_split_or_folder(name)[0] for name in args.splits]
     for split, name in zip(splits, args.splits, strict=True):
         opt.require_other_name(words, split.name, name)
     results = [study_results(args.study, split) if args.study else {} for split in splits]
     library = opt.library_of(args)
-    rows: list[RobotDifficulty] = []
+    rows: list[survey.RobotDifficulty] = []
     for split, known in zip(splits, results, strict=True):
         with bar(args, split.name):
-            rows += split_difficulty(split, library, results=known, jobs=args.jobs)
+            rows += survey.split_difficulty(split, library, results=known, jobs=args.jobs)
     baselines = [name for name in BASELINES if any(name in known for known in results)]
     if args.csv is not None:
-        write_file(args.csv, difficulty_csv(rows, baselines))
+        write_file(args.csv, survey.difficulty_csv(rows, baselines))
     files = [] if args.csv is None else [str(args.csv)]
     data = {"rows": [row.as_dict() for row in rows], "files": files}
     opt.print_result(args, data, lambda: _difficulty_text(rows, splits, baselines, files))
 
 
 def _difficulty_text(
-    rows: Sequence[RobotDifficulty],
+    rows: Sequence[survey.RobotDifficulty],
     splits: Sequence[Split],
     baselines: Sequence[str],
     files: Sequence[str],
@@ -265,7 +238,7 @@ def _difficulty_text(
     for split in splits:
         own = [row for row in rows if row.split == split.name]
         columns = [name for name in baselines if any(name in row.baselines for row in own)]
-        parts.append(f"{split.name}\n{difficulty_table(own, columns)}")
+        parts.append(f"{split.name}\n{survey.difficulty_table(own, columns)}")
     notes = ["nearest: the most similar other train robot and its value by each measure"]
     if baselines:
         notes.append("baselines: score, success rate")
@@ -303,13 +276,13 @@ def stats(args: argparse.Namespace) -> None:
             table([list(row.values()) for row in rows], list(rows[0]), style=style),
             "",
             "links, joints, mass: mean over the train robots; cosine: of test and train robots",
-            f"in parentheses: {PAPER_TABLE}",
+            f"in parentheses: {survey.PAPER_TABLE}",
         ]
         for title, parts in limits.items():
             lines += [f"restricted licence in {title}: {restriction_text(part)}" for part in parts]
         return "\n".join(lines)
 
-    opt.print_result(args, {"rows": data, "paper": PAPER_TABLE}, text)
+    opt.print_result(args, {"rows": data, "paper": survey.PAPER_TABLE}, text)
 
 
 def _by_robots(splits: Sequence[Split]) -> dict[str, list[Split]]:
@@ -330,7 +303,7 @@ def _common_prefix(names: Sequence[str]) -> str:
 
 
 def _stats_row(
-    title: str, statistics: Mapping[str, Any], paper_row: PaperRow | None
+    title: str, statistics: Mapping[str, Any], paper_row: survey.PaperRow | None
 ) -> dict[str, str]:
     train, cosine = statistics["train"], statistics["cosine"]
 
@@ -423,12 +396,12 @@ def release(args: argparse.Namespace) -> None:
     split, library = read_split(args.split), opt.library_of(args)
     protocol = EvalProtocol(args.sim or DEFAULT_SIMULATOR, args.episodes or DEFAULT_EPISODES)
     extra: dict[str, bytes] = {}
-    results: BaselineResults = {}
+    results: survey.BaselineResults = {}
     if args.scores:
         with bar(args, "checking the scores"):
             references = collect_references(args.scores, split, protocol, library, jobs=args.jobs)
         extra, results = reference_files(references), references.results()
-    request = ReleaseRequest(
+    request = releases.ReleaseRequest(
         version=args.release_version,
         date=args.date,
         creators=tuple(args.creator),
@@ -438,22 +411,22 @@ def release(args: argparse.Namespace) -> None:
         ),
         protocol=protocol,
         goals=not args.no_goals,
-        settings=BuildSettings(light=args.light),
+        settings=split_folder.BuildSettings(light=args.light),
     )
-    require_releasable(split, library, request)
+    releases.require_releasable(split, library, request)
     notes = _notes(args, split, extra)
     if not args.json:
         print("".join(f"note: {note}\n" for note in notes), end="", flush=True)
-    archive = archive_path(args.out, split, request.version)
+    archive = releases.archive_path(args.out, split, request.version)
     if args.dry_run:
         with bar(args, "checking"):
-            check_release(split, library, request, jobs=args.jobs)
+            releases.check_release(split, library, request, jobs=args.jobs)
         data: dict[str, object] = {"archive": str(archive), "notes": notes}
         text = f"{archive} would be written: names, licences and audit are in order"
         opt.print_result(args, data, lambda: text)
         return
     with bar(args, "releasing"):
-        report = release_split(
+        report = releases.release_split(
             split, args.out, library, request, extra=extra, results=results, jobs=args.jobs
         )
     data = {
@@ -476,11 +449,11 @@ def release(args: argparse.Namespace) -> None:
 def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -> list[str]:
     """Return what the release lacks that its users may expect, and what may keep it from it."""
     notes = []
-    archive = archive_path(args.out, split, args.release_version)
+    archive = releases.archive_path(args.out, split, args.release_version)
     if archive.exists():
         notes.append(f"{archive} exists: it stays, unless the content is the same")
     is_relative = any(TASKS[task].relative_to_random for task in tasks_of_split(split))
-    if is_relative and f"{SUBMISSIONS_DIR}/random.json" not in extra:
+    if is_relative and f"{releases.SUBMISSIONS_DIR}/random.json" not in extra:
         missing = "submission of random among --scores" if extra else "reference scores"
         notes.append(
             f"no {missing}: split score cannot check the random_score of submissions; add one of "
@@ -605,14 +578,14 @@ def _shipped_split(name: str, where: Path) -> str:
 def _open(name: str, stack: ExitStack) -> tuple[Split, EvalProtocol, References, str]:
     """Return a split, its rules, reference scores, and the version of morphgen they are of."""
     path = Path(name)
-    if not path.is_dir() and not is_archive(path):
+    if not path.is_dir() and not split_folder.is_archive(path):
         return read_split(name), EvalProtocol(), References(), version("morphgen")
-    folder = stack.enter_context(opened_folder(path))
-    require_unchanged(folder, name)
-    split = read_split(folder / SPLIT_FILE)
-    if not is_release(folder):
+    folder = stack.enter_context(releases.opened_folder(path))
+    split_folder.require_unchanged(folder, name)
+    split = read_split(folder / split_folder.SPLIT_FILE)
+    if not releases.is_release(folder):
         return split, EvalProtocol(), References(), version("morphgen")
-    release = read_release(folder)
+    release = releases.read_release(folder)
     protocol = protocol_from(release.evaluation, name)
     return split, protocol, read_references(folder), release.morphgen
 

@@ -11,28 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from morphgen.api import training
-from morphgen.api.training import (
-    TrainingRun,
-    named_source,
-    read_constants,
-    resumed_config,
-    run_config,
-    split_side,
-    train_run,
-    with_goal,
-)
-from morphgen.benchmark.scores.study import (
-    TABLE,
-    Cell,
-    agent_cell,
-    baseline_cells,
-    finetuning_run,
-    matched_budget,
-    require_cells,
-    run_cells,
-    run_cells_on_ray,
-    write_tables,
-)
+from morphgen.benchmark.scores import study as studies
 from morphgen.benchmark.scores.submission import EvalProtocol
 from morphgen.cli import options as opt
 from morphgen.cli.progress import note, status, training_progress
@@ -94,7 +73,7 @@ def train(args: argparse.Namespace) -> None:
     print_run(run, args.minutes)
 
 
-def print_run(run: TrainingRun, minutes: int | None) -> None:
+def print_run(run: training.TrainingRun, minutes: int | None) -> None:
     """Print the paths of the checkpoints, and say how to go on."""
     if text := str(run):
         print(text)
@@ -106,7 +85,7 @@ def print_run(run: TrainingRun, minutes: int | None) -> None:
         note(_next_command(run))
 
 
-def _next_command(run: TrainingRun) -> str:
+def _next_command(run: training.TrainingRun) -> str:
     """Return lines that say how to score or watch what was trained."""
     source, folder = run.config.source, str(run.folder)
     # Only the script that registered a task can play it.
@@ -137,13 +116,13 @@ def finetune(args: argparse.Namespace) -> None:
     folder = args.out or parent / "finetuned" / f"{args.on}-seed{args.seed}"
     with training_progress(RESUME) as display:
         given = SimpleNamespace(**vars(args), show=display.training)
-        run = train_run(folder, _finetuning_config(file, folder, args), given)
+        run = training.train_run(folder, _finetuning_config(file, folder, args), given)
     print_run(run, args.minutes)
 
 
 def _finetuning_config(file: Path, folder: Path, args: argparse.Namespace) -> RunConfig:
     initial, _ = read_checkpoint(file)
-    resumed = resumed_config(folder, resume=args.resume)
+    resumed = training.resumed_config(folder, resume=args.resume)
     steps, envs, sim = (
         (resumed.ppo.total_timesteps, resumed.num_envs, resumed.sim)
         if resumed
@@ -152,10 +131,10 @@ def _finetuning_config(file: Path, folder: Path, args: argparse.Namespace) -> Ru
     source: Source
     if args.words:
         given = SimpleNamespace(**vars(args), robots=" ".join(args.words))
-        source = named_source(given, args.on)
+        source = training.named_source(given, args.on)
     else:
         source = other_side(initial.source, args.on)  # drawn robots have none
-    changes = read_constants(args.constants)
+    changes = training.read_constants(args.constants)
     if unknown := set(changes) - {field.name for field in fields(PPOConfig)}:
         raise TaskError(f"--set {min(unknown)}: the networks are those of the checkpoint")
     switches = {"bf16": args.bf16, "compile": args.compile}
@@ -167,7 +146,7 @@ def _finetuning_config(file: Path, folder: Path, args: argparse.Namespace) -> Ru
         sim=args.sim or sim,
         num_envs=args.envs or envs,
         device=args.device,
-        tasks=with_goal(initial.tasks, args.goal, tasks_of(source)),
+        tasks=training.with_goal(initial.tasks, args.goal, tasks_of(source)),
     )
 
 
@@ -178,18 +157,18 @@ def study(args: argparse.Namespace) -> int:
     """Train, evaluate, write tables, and print failures."""
     execution = ExecutionConfig(args.workers, args.tensorboard, args.wandb)
     cells = _cells(args)
-    require_cells(cells)
+    studies.require_cells(cells)
     args.out.mkdir(parents=True, exist_ok=True)
     failures = 0 if args.report else _run_cells(args, cells, execution)
     with status(args, "scoring"):
-        written = write_tables(args.out, cells)
-    print((args.out / TABLE).read_text(encoding="utf-8"))
+        written = studies.write_tables(args.out, cells)
+    print((args.out / studies.TABLE).read_text(encoding="utf-8"))
     for path in written:
         print(path)
     return int(failures > 0)
 
 
-def _cells(args: argparse.Namespace) -> list[Cell]:
+def _cells(args: argparse.Namespace) -> list[studies.Cell]:
     """Return the cells of the study, baselines first."""
     episode_steps = max(config.max_episode_steps for config in default_configs())
     num_episodes = episodes_for(args.eval_steps, episode_steps)
@@ -197,36 +176,36 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
     options = SimpleNamespace(**vars(args), seed=0)
     agents, seeds = parse_agents(args.agents or ",".join(AGENTS)), _seeds(args.seeds)
     finetune = sorted(set(args.finetune))
-    cells: list[Cell] = []
+    cells: list[studies.Cell] = []
     words: dict[str, str] = {}
     for name in dict.fromkeys(chain.from_iterable(map(_splits, args.words))):
-        source = split_side(name, "train", args.goal_seed, args.library)
+        source = training.split_side(name, "train", args.goal_seed, args.library)
         opt.require_other_name(words, source.name, name)
         sides = tasks_of(source), tasks_of(other_side(source, "test"))
-        tasks = with_goal(default_configs(), args.goal, chain(*sides))
+        tasks = training.with_goal(default_configs(), args.goal, chain(*sides))
         eval_config = EvalConfig(num_episodes, sim, tasks=tasks)
         if sim in SIMULATORS.builtin:  # the episodes become submissions, whose number is limited
             EvalProtocol(sim, num_episodes, goals=GoalConfig(source.goal_seed, tasks))
-        cells += baseline_cells(args.out, source, eval_config)
+        cells += studies.baseline_cells(args.out, source, eval_config)
         for label, spec, side in agents:
-            config = run_config(other_side(source, side), spec, options)
+            config = training.run_config(other_side(source, side), spec, options)
             for seed in seeds:
-                seeded = matched_budget(replace(config, seed=seed))
-                cell = agent_cell(args.out, label, seeded, eval_config, finetune)
+                seeded = studies.matched_budget(replace(config, seed=seed))
+                cell = studies.agent_cell(args.out, label, seeded, eval_config, finetune)
                 cells.append(cell)
                 if not args.report:
                     _require_startable(cell, seeded, args)
     return cells
 
 
-def _require_startable(cell: Cell, config: RunConfig, args: argparse.Namespace) -> None:
+def _require_startable(cell: studies.Cell, config: RunConfig, args: argparse.Namespace) -> None:
     """Require that training and fine-tuning of a cell can begin, before any of them does."""
     parts = subruns_of(cell.folder, config)
     for part in parts:
         require_runnable(part.config)
     for steps in cell.finetune:
         try:
-            require_runnable(finetuning_run(cell, config, steps))
+            require_runnable(studies.finetuning_run(cell, config, steps))
         except TaskError as error:
             raise TaskError(f"--finetune {steps}: {error}") from error
     is_on_gpu = args.device != "cpu" and args.ray is None  # with Ray, other machines have the GPUs
@@ -255,15 +234,17 @@ def _seeds(text: str) -> list[int]:
     return seeds
 
 
-def _run_cells(args: argparse.Namespace, cells: list[Cell], execution: ExecutionConfig) -> int:
+def _run_cells(
+    args: argparse.Namespace, cells: list[studies.Cell], execution: ExecutionConfig
+) -> int:
     """Run the cells and return how many failed."""
     failures = 0
     with training_progress("if the same command is given again") as show:
         if args.ray is None:
-            outcomes = run_cells(cells, execution, show.training)
+            outcomes = studies.run_cells(cells, execution, show.training)
         else:
             gpus = args.gpus if args.gpus is not None else float(args.device != "cpu")
-            outcomes = run_cells_on_ray(cells, execution, args.ray or None, gpus=gpus)
+            outcomes = studies.run_cells_on_ray(cells, execution, args.ray or None, gpus=gpus)
         for done, (cell, error) in enumerate(outcomes, 1):
             show.close()
             seed = "" if cell.seed is None else f" seed {cell.seed}"

@@ -25,18 +25,8 @@ from morphgen.fitting.link_fit import FitOptions, LinkFit, fit_shapes
 from morphgen.fitting.quality import Quality, quality
 from morphgen.fitting.solid import Solid, solid_of
 from morphgen.fitting.token_shapes import token_of_primitives
+from morphgen.formats import fits as fit_files
 from morphgen.formats.files import write_file
-from morphgen.formats.fits import (
-    SUFFIX,
-    are_primitives,
-    find_fit,
-    fits_text,
-    has_meshes,
-    read_stored_fits,
-    shapes_key,
-    shapes_scale,
-    shapes_to_fit,
-)
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Manifest
 from morphgen.grammar.part import load_part
@@ -258,17 +248,19 @@ def fit_links(
     solids: dict[str, Solid] = {}
     failures: dict[str, FitError] = {}
     links = [
-        link for link in robot.links if shapes_to_fit(link) and (only is None or link.name in only)
+        link
+        for link in robot.links
+        if fit_files.shapes_to_fit(link) and (only is None or link.name in only)
     ]
     for link in links:
         try:
-            solids[link.name] = solid_of(shapes_to_fit(link))
+            solids[link.name] = solid_of(fit_files.shapes_to_fit(link))
         except FitError as error:
             failures[link.name] = error
     solid_links = [link for link in links if link.name in solids]
     shared = representatives([solids[link.name].mesh for link in solid_links])
     unique = [link for i, link in enumerate(solid_links) if shared[i][0] == i]
-    inputs = [(shapes_to_fit(link), solids[link.name]) for link in unique]
+    inputs = [(fit_files.shapes_to_fit(link), solids[link.name]) for link in unique]
     # A fit takes seconds: one item a worker at a time.
     attempts = parallel_map(partial(_try_fit, options), inputs, jobs, chunk=1)
     fits = {link.name: fit for link, fit in zip(unique, attempts, strict=True)}
@@ -313,7 +305,7 @@ def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manife
 
     With ``missing``, only those with a link whose fit is not stored.
     """
-    stored = read_stored_fits(library.folders) if missing else {}
+    stored = fit_files.read_stored_fits(library.folders) if missing else {}
     return [
         manifest
         for manifest in library.manifests()
@@ -323,8 +315,8 @@ def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manife
 
 def _mesh_keys(manifest: Manifest) -> set[str]:
     """Return the keys of the shapes of links with meshes."""
-    links = (shapes_to_fit(link) for link in load_part(manifest).fragment.links)
-    return {shapes_key(shapes) for shapes in links if has_meshes(shapes)}
+    links = (fit_files.shapes_to_fit(link) for link in load_part(manifest).fragment.links)
+    return {fit_files.shapes_key(shapes) for shapes in links if fit_files.has_meshes(shapes)}
 
 
 def store_parts(manifests: Sequence[Manifest], *, jobs: int = 1) -> Iterator[Path]:
@@ -337,11 +329,11 @@ def store_part(manifest: Manifest) -> Path:
     fragment = load_part(manifest).fragment
     fits = {}
     for report in fit_links(fragment, COLLISION_OPTIONS).links:
-        shapes = shapes_to_fit(fragment.link(report.link))
+        shapes = fit_files.shapes_to_fit(fragment.link(report.link))
         fit = _with_token(report.link, shapes, report.fit)
-        fits[shapes_key(shapes)] = fit.scaled(1 / shapes_scale(shapes))
-    path = manifest.path.with_name(manifest.path.stem + SUFFIX)
-    write_file(path, fits_text(fits))
+        fits[fit_files.shapes_key(shapes)] = fit.scaled(1 / fit_files.shapes_scale(shapes))
+    path = manifest.path.with_name(manifest.path.stem + fit_files.SUFFIX)
+    write_file(path, fit_files.fits_text(fits))
     return path
 
 
@@ -352,8 +344,8 @@ def fits_of(robot: Robot, report: FitReport, stored: StoredFits) -> dict[str, St
     """
     fits = {}
     for row in report.links:
-        shapes = shapes_to_fit(robot.link(row.link))
-        if known := find_fit(shapes, robot, stored):
+        shapes = fit_files.shapes_to_fit(robot.link(row.link))
+        if known := fit_files.find_fit(shapes, robot, stored):
             fits[row.link] = replace(
                 known, collision=row.fit.primitives, collision_iou=row.fit.quality.iou
             )
@@ -366,7 +358,7 @@ def _with_token(link: str, shapes: Sequence[Shape], fit: LinkFit) -> StoredFit:
     """Return a link's fit with the primitive of its token, which is fitted if it is missing."""
     solid = solid_of(shapes)
     single = fit.single
-    if single is None and are_primitives(shapes):
+    if single is None and fit_files.are_primitives(shapes):
         single = token_of_primitives(shapes)
     if single is None:
         fitted = fit_shapes(shapes, TOKEN_OPTIONS, solid=solid)

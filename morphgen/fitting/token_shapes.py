@@ -17,16 +17,8 @@ from platformdirs import user_cache_path
 from morphgen.errors import FitError, FormatError
 from morphgen.files import keep_file
 from morphgen.fitting.canonical import KINDS, Kind, canonical, rounded
+from morphgen.formats import fits
 from morphgen.formats.data_files import read_json
-from morphgen.formats.fits import (
-    ShapeRecord,
-    are_primitives,
-    find_fit,
-    read_stored_fits,
-    shape_to_data,
-    shapes_key,
-    shapes_scale,
-)
 from morphgen.formats.records import read_record
 from morphgen.formats.rounding import rounded_shapes
 from morphgen.formats.urdf.write import urdf_pieces
@@ -347,7 +339,7 @@ def token_shapes(robot: Robot, folders: Sequence[Path] = ()) -> dict[str, Shape]
     Returns:
         Primitives by link name, without links that have no collision shapes or no volume.
     """
-    stored = read_stored_fits(folders)
+    stored = fits.read_stored_fits(folders)
     primitives: dict[str, Shape | None] = {}
     missing: list[tuple[str, tuple[Shape, ...], Path]] = []
     for link in robot.links:
@@ -355,18 +347,18 @@ def token_shapes(robot: Robot, folders: Sequence[Path] = ()) -> dict[str, Shape]
             continue
         pieces = (piece for shape in link.collisions for piece in urdf_pieces(shape))
         shapes = rounded_shapes(tuple(pieces))
-        if fit := find_fit(link.collisions, robot, stored):
+        if fit := fits.find_fit(link.collisions, robot, stored):
             primitives[link.name] = fit.token
         elif dominant := _dominant_primitive(shapes):
             primitives[link.name] = dominant
         else:
-            path = user_cache_path("morphgen") / _CACHE_DIR / f"{shapes_key(shapes)}.json"
+            path = user_cache_path("morphgen") / _CACHE_DIR / f"{fits.shapes_key(shapes)}.json"
             if path.is_file():
-                primitives[link.name] = _read_cached(path, shapes_scale(shapes))
+                primitives[link.name] = _read_cached(path, fits.shapes_scale(shapes))
             else:
                 primitives[link.name] = None  # keeps the order of the links
                 missing.append((link.name, shapes, path))
-    if num_meshes := sum(not are_primitives(shapes) for _, shapes, _ in missing):
+    if num_meshes := sum(not fits.are_primitives(shapes) for _, shapes, _ in missing):
         _LOGGER.warning(
             "fitting the primitives of tokens to %d links of robot %r; they are kept",
             num_meshes,
@@ -375,7 +367,7 @@ def token_shapes(robot: Robot, folders: Sequence[Path] = ()) -> dict[str, Shape]
     for done, (name, shapes, path) in enumerate(missing):
         report(done, len(missing))
         primitives[name] = fit_primitive(shapes)
-        _write_cached(path, primitives[name], shapes_scale(shapes))
+        _write_cached(path, primitives[name], fits.shapes_scale(shapes))
     if missing:
         report(len(missing), len(missing))
     return {name: shape for name, shape in primitives.items() if shape}
@@ -389,7 +381,7 @@ def token_of_primitives(shapes: Sequence[Shape]) -> Shape | None:
 
 def fit_primitive(shapes: Sequence[Shape]) -> Shape | None:
     """Fit one primitive to shapes that are fixed to each other; None if they have no volume."""
-    if are_primitives(shapes):
+    if fits.are_primitives(shapes):
         return fit_composite(shapes)
     # The search needs packages of the extra fit.
     from morphgen.fitting.link_fit import FitOptions, fit_shapes
@@ -405,7 +397,7 @@ def _dominant_primitive(shapes: Sequence[Shape]) -> Shape | None:
 
     It is in its canonical pose.
     """
-    if not are_primitives(shapes):
+    if not fits.are_primitives(shapes):
         return None
     largest = max(shapes, key=lambda shape: union_volume([shape]))
     share = union_volume([largest]) / union_volume(shapes)
@@ -416,12 +408,12 @@ def _read_cached(path: Path, scale: float) -> Shape | None:
     """Read a cached fit, which has the scale 1."""
     try:
         data = read_json(path)
-        record = None if data is None else read_record(data, ShapeRecord, str(path))
+        record = None if data is None else read_record(data, fits.ShapeRecord, str(path))
     except FormatError as error:
         raise FormatError(f"{error}; delete the file") from error
     return None if record is None else scale_shape(record.shape, scale)
 
 
 def _write_cached(path: Path, shape: Shape | None, scale: float) -> None:
-    data = None if shape is None else shape_to_data(scale_shape(shape, 1 / scale))
+    data = None if shape is None else fits.shape_to_data(scale_shape(shape, 1 / scale))
     keep_file(path, json.dumps(data), "fits")

@@ -10,22 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from morphgen.errors import GrammarError, nearest
-from morphgen.grammar.syntax import (
-    MAX_FILES,
-    MAX_STATEMENTS,
-    MAX_TEXT,
-    Alternative,
-    Expression,
-    Include,
-    Item,
-    Let,
-    Production,
-    SourceLocation,
-    Statement,
-    Where,
-    parse_grammar,
-    require_at_most,
-)
+from morphgen.grammar import syntax
 from morphgen.grammar.values import require_condition
 
 SUFFIX = ".grammar"
@@ -37,23 +22,23 @@ class Grammar:
 
     name: str  # name of the file without its suffix
     start: str  # the symbol that derivations begin with: the first one of the file
-    productions: tuple[Production, ...]
-    lets: tuple[Let, ...] = ()  # named values that are drawn once per robot
-    wheres: tuple[Expression, ...] = ()  # conditions that every robot meets
+    productions: tuple[syntax.Production, ...]
+    lets: tuple[syntax.Let, ...] = ()  # named values that are drawn once per robot
+    wheres: tuple[syntax.Expression, ...] = ()  # conditions that every robot meets
     digest: str = ""  # SHA-256 of the texts that the grammar was read from, hexadecimal
 
-    def production(self, symbol: str) -> Production | None:
+    def production(self, symbol: str) -> syntax.Production | None:
         """Return the production of a symbol; None if the name is a part."""
         return self._by_symbol.get(symbol)
 
-    def alternatives(self) -> Iterator[tuple[Production, Alternative]]:
+    def alternatives(self) -> Iterator[tuple[syntax.Production, syntax.Alternative]]:
         """Yield every alternative with its production."""
         for production in self.productions:
             for alternative in production.alternatives:
                 yield production, alternative
 
     @cached_property
-    def _by_symbol(self) -> Mapping[str, Production]:
+    def _by_symbol(self) -> Mapping[str, syntax.Production]:
         return {production.symbol: production for production in self.productions}
 
 
@@ -96,9 +81,9 @@ def load_grammar(path: Path, folders: Iterable[Path] = ()) -> Grammar:
 
 def grammar_from_text(text: str, name: str) -> Grammar:
     """Read a grammar from a text without includes, such as that of ``grammar_text``."""
-    statements = parse_grammar(text, name)
+    statements = syntax.parse_grammar(text, name)
     for statement in statements:
-        if isinstance(statement, Include):
+        if isinstance(statement, syntax.Include):
             raise GrammarError(
                 f"{statement.location}: a grammar given as text cannot include others"
             )
@@ -114,16 +99,18 @@ def grammar_text(grammar: Grammar) -> str:
         lines.append(f"{production.symbol} -> {' | '.join(alternatives)}")
     lines += [f"where {condition}" for condition in grammar.wheres]
     text = "".join(f"{line}\n" for line in lines)
-    require_at_most(len(text), MAX_TEXT, f"{grammar.name}: {len(text):,} characters as one text")
+    syntax.require_at_most(
+        len(text), syntax.MAX_TEXT, f"{grammar.name}: {len(text):,} characters as one text"
+    )
     return text
 
 
-def _alternative_text(alternative: Alternative) -> str:
+def _alternative_text(alternative: syntax.Alternative) -> str:
     weight = f"@weight({alternative.weight}) " if alternative.weight else ""
     return weight + " ".join(map(_item_text, alternative.items))
 
 
-def _item_text(item: Item) -> str:
+def _item_text(item: syntax.Item) -> str:
     values = ", ".join(f"{name}={value}" for name, value in item.arguments)
     low, high = item.repetition or (0, 0)
     return (
@@ -135,19 +122,19 @@ def _item_text(item: Item) -> str:
 
 
 def _build(
-    name: str, origin: str, statements: Sequence[Statement], texts: Iterable[str]
+    name: str, origin: str, statements: Sequence[syntax.Statement], texts: Iterable[str]
 ) -> Grammar:
-    productions = [s for s in statements if isinstance(s, Production)]
+    productions = [s for s in statements if isinstance(s, syntax.Production)]
     if not productions:
         raise GrammarError(f"{origin}: no production, such as: robot -> base arm ee")
     in_file = [p for p in productions if p.location.origin == origin]
     start = (in_file or productions)[0].symbol
-    wheres = tuple(s.condition for s in statements if isinstance(s, Where))
+    wheres = tuple(s.condition for s in statements if isinstance(s, syntax.Where))
     for where in wheres:
         require_condition(where)
     # Of several definitions the last counts; a file comes after those that it includes.
     symbols = {p.symbol: p for p in productions}
-    lets = {s.name: s for s in statements if isinstance(s, Let)}
+    lets = {s.name: s for s in statements if isinstance(s, syntax.Let)}
     digest = hashlib.sha256("\0".join(texts).encode()).hexdigest()
     return Grammar(name, start, tuple(symbols.values()), tuple(lets.values()), wheres, digest)
 
@@ -158,21 +145,21 @@ class _Reader:
     def __init__(self, path: Path, folders: tuple[Path, ...]) -> None:
         self._folders = folders
         self._roots = [folder.resolve() for folder in (path.parent, *folders, _shipped())]
-        self.statements: list[Statement] = []
+        self.statements: list[syntax.Statement] = []
         """Statements of all files, those of an include before those of the including file."""
         self.texts: list[str] = []
         self._read(path, ())
         what = f"{path}: {len(self.statements):,} statements with its includes"
-        require_at_most(len(self.statements), MAX_STATEMENTS, what)
+        syntax.require_at_most(len(self.statements), syntax.MAX_STATEMENTS, what)
 
     def _read(self, path: Path, above: tuple[Path, ...]) -> None:
         if path.resolve() in (p.resolve() for p in above):
             chain = " -> ".join(p.name for p in (*above, path))
             raise GrammarError(f"{above[-1]}: grammars include each other: {chain}")
         text = self._text(path)
-        statements: list[Statement] = []
-        for statement in parse_grammar(text, str(path)):
-            if isinstance(statement, Include):
+        statements: list[syntax.Statement] = []
+        for statement in syntax.parse_grammar(text, str(path)):
+            if isinstance(statement, syntax.Include):
                 self._read(self._included(statement, path), (*above, path))
             else:
                 statements.append(statement)
@@ -181,11 +168,11 @@ class _Reader:
 
     def _text(self, path: Path) -> str:
         """Read a file; the size limit applies to it and all files read before."""
-        if len(self.texts) == MAX_FILES:
+        if len(self.texts) == syntax.MAX_FILES:
             raise GrammarError(
-                f"{path}: one file too many: a grammar is read from at most {MAX_FILES}"
+                f"{path}: one file too many: a grammar is read from at most {syntax.MAX_FILES}"
             )
-        room = MAX_TEXT - sum(len(text.encode()) for text in self.texts)
+        room = syntax.MAX_TEXT - sum(len(text.encode()) for text in self.texts)
         try:
             with path.open("rb") as file:
                 content = file.read(room + 1)
@@ -194,13 +181,13 @@ class _Reader:
             raise GrammarError(f"{path}: cannot be read: {error}") from error
         if len(content) > room:
             raise GrammarError(
-                f"{path}: {path.stat().st_size:,} bytes; expected at most {MAX_TEXT:,} in a "
+                f"{path}: {path.stat().st_size:,} bytes; expected at most {syntax.MAX_TEXT:,} in a "
                 "grammar with its includes"
             )
         self.texts.append(text)
         return text
 
-    def _included(self, include: Include, path: Path) -> Path:
+    def _included(self, include: syntax.Include, path: Path) -> Path:
         """Return the file that an include in the file ``path`` names."""
         if not (include.target.endswith(SUFFIX) or "/" in include.target):
             try:
@@ -224,12 +211,12 @@ class _Reader:
         return target
 
 
-def _require_unique(statements: Iterable[Statement]) -> None:
+def _require_unique(statements: Iterable[syntax.Statement]) -> None:
     """Require that a file defines no symbol and no ``let`` twice."""
-    definitions: dict[tuple[type, str], SourceLocation] = {}
+    definitions: dict[tuple[type, str], syntax.SourceLocation] = {}
     for statement in statements:
-        if isinstance(statement, Production | Let):
-            name = statement.symbol if isinstance(statement, Production) else statement.name
+        if isinstance(statement, syntax.Production | syntax.Let):
+            name = statement.symbol if isinstance(statement, syntax.Production) else statement.name
             key = (type(statement), name)
             if key in definitions:
                 raise GrammarError(

@@ -19,25 +19,14 @@ import trimesh
 from numpy.typing import NDArray
 
 from morphgen.errors import MeshError
+from morphgen.model import scene_files
 from morphgen.model.geometry import MESH_SUFFIXES, MeshContent, MeshPart
-from morphgen.model.scene_files import (
-    MAX_SETS,
-    UNREADABLE,
-    FolderResolver,
-    note_missing,
-    parse_numbers,
-    read_dae,
-    read_glb,
-    read_gltf,
-    require_faces,
-    scene_parts,
-)
 from morphgen.typing import Array
 
 
 def _parts(mesh: trimesh.Trimesh) -> list[MeshPart]:
-    require_faces(len(mesh.faces))
-    return scene_parts(trimesh.Scene(mesh))
+    scene_files.require_faces(len(mesh.faces))
+    return scene_files.scene_parts(trimesh.Scene(mesh))
 
 
 _MAX_TOKENS = 20_000_000  # number of words in the largest OBJ file that is read
@@ -51,12 +40,12 @@ def read_mesh_file(path: Path) -> MeshContent:
     if suffix not in MESH_SUFFIXES:
         valid = ", ".join(MESH_SUFFIXES)
         raise MeshError(f"{path}: cannot read {path.suffix!r} meshes; valid: {valid}")
-    files = FolderResolver(path.parent)
+    files = scene_files.FolderResolver(path.parent)
     try:
         data = files.get(path.name)
         _require_mesh(data, suffix)
         parts = _READERS[suffix](data, files)
-    except UNREADABLE as error:
+    except scene_files.UNREADABLE as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MeshError(f"{path}: not a readable {path.suffix[1:]} mesh: {reason}") from error
     notes = [
@@ -89,7 +78,7 @@ def _require_mesh(data: bytes, suffix: str) -> None:
 _STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
-def _read_stl(data: bytes, files: FolderResolver) -> list[MeshPart]:
+def _read_stl(data: bytes, files: scene_files.FolderResolver) -> list[MeshPart]:
     """Read all solids of an STL file, which may have been concatenated from several."""
     if data.lstrip()[:5].lower() == b"solid" and b"\0" not in data[:1024]:
         corners = _ascii_stl(data)
@@ -104,7 +93,7 @@ def _read_stl(data: bytes, files: FolderResolver) -> list[MeshPart]:
 
 def _ascii_stl(data: bytes) -> Array:
     text = data.lower()
-    require_faces(text.count(b"endloop"))
+    scene_files.require_faces(text.count(b"endloop"))
     vertices = re.findall(rb"\bvertex((?:\s+[-+.\dein]\S*){3})", text)
     facets, ends = len(re.findall(rb"\bouter\s+loop\b", text)), text.count(b"endloop")
     rest = text[text.rfind(b"endloop") :].replace(b"endfacet", b"")
@@ -114,10 +103,10 @@ def _ascii_stl(data: bytes) -> Array:
             f"{len(vertices)} vertices in {facets} facets, {ends} of which end; expected 3 each: "
             "it is truncated or malformed"
         )
-    return parse_numbers(b" ".join(vertices)).reshape(-1, 3, 3)
+    return scene_files.parse_numbers(b" ".join(vertices)).reshape(-1, 3, 3)
 
 
-def _binary_stl(data: bytes, files: FolderResolver) -> Array:
+def _binary_stl(data: bytes, files: scene_files.FolderResolver) -> Array:
     solids: list[Array] = []
     start = 0
     while len(data) - start >= 84:
@@ -130,7 +119,7 @@ def _binary_stl(data: bytes, files: FolderResolver) -> Array:
             )
         if end > len(data) or (start and not count):  # what follows is no further solid
             break
-        require_faces(sum(map(len, solids)) + count)
+        scene_files.require_faces(sum(map(len, solids)) + count)
         solids.append(np.frombuffer(data, _STL_ROW, count, start + 84)["corners"])
         start = end
     if not solids:
@@ -158,7 +147,7 @@ _PLY_TYPES = {
 }
 
 
-def _read_ply(data: bytes, files: FolderResolver) -> list[MeshPart]:
+def _read_ply(data: bytes, files: scene_files.FolderResolver) -> list[MeshPart]:
     end = data.find(b"end_header", 0, _MAX_HEADER)
     if not data.startswith(b"ply") or end < 0:
         raise ValueError(f"no PLY header of at most {_MAX_HEADER} bytes: it is truncated")
@@ -167,7 +156,7 @@ def _read_ply(data: bytes, files: FolderResolver) -> list[MeshPart]:
     body = data[data.index(b"\n", end) + 1 :]
     byte_order = ">" if "big" in order else "<"
     if order == "ascii":  # from here on as a binary file of doubles
-        body = parse_numbers(body).tobytes()
+        body = scene_files.parse_numbers(body).tobytes()
     elements: list[tuple[str, int, list[tuple[str, ...]]]] = []
     for line in lines:
         match line:
@@ -204,7 +193,9 @@ def _ply_element(
     rows = _uniform_rows(body, start, count, properties)
     if rows is not None:
         return {entry[0]: rows[f"c{i}"] for i, entry in enumerate(properties)}, start + rows.nbytes
-    require_faces(count)  # the rows have lists of different lengths, so they are read one by one
+    scene_files.require_faces(
+        count
+    )  # the rows have lists of different lengths, so they are read one by one
     columns: dict[str, list[Any]] = {entry[0]: [] for entry in properties}
     for _ in range(count):
         for column, *codes in properties:
@@ -243,7 +234,7 @@ _Rows = NDArray[Any] | Sequence[NDArray[Any]]
 
 
 def _ply_parts(
-    columns: dict[str, dict[str, Any]], counts: dict[str, int], files: FolderResolver
+    columns: dict[str, dict[str, Any]], counts: dict[str, int], files: scene_files.FolderResolver
 ) -> list[MeshPart]:
     vertex, face = columns.get("vertex", {}), columns.get("face", {})
     polygons: _Rows = face.get("vertex_indices", face.get("vertex_index", ()))
@@ -254,7 +245,7 @@ def _ply_parts(
         raise ValueError("holds no vertex with x, y and z")
     vertices = np.column_stack([vertex[axis] for axis in "xyz"]).astype(np.float64)
     triangles = np.concatenate([np.empty((0, 3), np.int64), *_fans(polygons, files)])
-    require_faces(len(triangles))
+    scene_files.require_faces(len(triangles))
     if not len(triangles):
         raise ValueError(f"holds {len(vertices)} vertices and no triangle")
     mesh = trimesh.Trimesh(
@@ -273,7 +264,7 @@ def _ply_colours(columns: dict[str, Any], count: int) -> Array | None:
     return np.column_stack(channels) if has_colours else None
 
 
-def _fans(polygons: _Rows, files: FolderResolver) -> Iterator[NDArray[np.int64]]:
+def _fans(polygons: _Rows, files: scene_files.FolderResolver) -> Iterator[NDArray[np.int64]]:
     """Yield the triangles of polygons: an array with a row for each, or a list of arrays."""
     by_size: dict[int, list[Any]] = {}
     if isinstance(polygons, np.ndarray):
@@ -283,13 +274,13 @@ def _fans(polygons: _Rows, files: FolderResolver) -> Iterator[NDArray[np.int64]]
             by_size.setdefault(len(polygon), []).append(polygon)
     for size, rows in by_size.items():
         corners = np.vstack(rows).astype(np.int64)
-        require_faces(len(corners) * max(size - 2, 0))
+        scene_files.require_faces(len(corners) * max(size - 2, 0))
         yield from (corners[:, [0, k, k + 1]] for k in range(1, size - 1))
         if size < 3:
             files.left_out.append(f"{len(corners)} faces of {size} vertices")
 
 
-def _read_obj(data: bytes, files: FolderResolver) -> list[MeshPart]:
+def _read_obj(data: bytes, files: scene_files.FolderResolver) -> list[MeshPart]:
     """Read an OBJ file by trimesh, rewritten where trimesh misreads it."""
     if data.count(b" ") + data.count(b"\t") > _MAX_TOKENS:
         raise ValueError(f"more than {_MAX_TOKENS} words")
@@ -297,7 +288,7 @@ def _read_obj(data: bytes, files: FolderResolver) -> list[MeshPart]:
     _require_short_lines(text)  # first: lines are split below
     faces = re.finditer(r"^[ \t]*f[ \t]([^#\n]*)", text, re.M)
     triangles = sum(max(len(face[1].split()) - 2, 0) for face in faces)
-    require_faces(triangles)
+    scene_files.require_faces(triangles)
     mixes_corners = re.search(r"^f[^\n]*//", text, re.M) and re.search(r"^f[^\n]*\d/\d", text, re.M)
     if mixes_corners or _OBJ_ODD.search(text):
         text = "\n".join(_plain_obj(text))
@@ -308,7 +299,7 @@ def _read_obj(data: bytes, files: FolderResolver) -> list[MeshPart]:
         if count := len(re.findall(rf"^{keyword}[ \t]", text, re.M)):
             files.left_out.append(f"{count} {meaning}")
     materials = set(re.findall(r"^usemtl +(.*?) *$", text, re.M))
-    if len(materials) > MAX_SETS or len(materials) * vertices > _MAX_WORK:
+    if len(materials) > scene_files.MAX_SETS or len(materials) * vertices > _MAX_WORK:
         raise ValueError(f"{len(materials)} materials for {vertices} vertices")
     libraries = re.findall(r"^[ \t]*mtllib[ \t]+(.*?)[ \t]*$", text, re.M)
     # trimesh 5.2.0 reads one library only.
@@ -319,8 +310,8 @@ def _read_obj(data: bytes, files: FolderResolver) -> list[MeshPart]:
     scene = trimesh.load_scene(
         io.BytesIO(text.encode()), file_type="obj", process=False, resolver=files
     )
-    parts = scene_parts(scene)
-    note_missing(files, triangles, parts)
+    parts = scene_files.scene_parts(scene)
+    scene_files.note_missing(files, triangles, parts)
     return parts
 
 
@@ -380,7 +371,7 @@ def _plain_corner(word: str, counts: dict[str, int]) -> str:
     return "/".join(indices)
 
 
-def _materials(libraries: list[str], used: set[str], files: FolderResolver) -> str:
+def _materials(libraries: list[str], used: set[str], files: scene_files.FolderResolver) -> str:
     """Return the materials of all libraries that an OBJ file names, with readable textures only."""
     texts = []
     for line in dict.fromkeys(libraries):
@@ -413,10 +404,10 @@ def _materials(libraries: list[str], used: set[str], files: FolderResolver) -> s
     return "\n".join(lines)
 
 
-_READERS: dict[str, Callable[[bytes, FolderResolver], list[MeshPart]]] = {
-    ".dae": read_dae,
-    ".glb": read_glb,
-    ".gltf": read_gltf,
+_READERS: dict[str, Callable[[bytes, scene_files.FolderResolver], list[MeshPart]]] = {
+    ".dae": scene_files.read_dae,
+    ".glb": scene_files.read_glb,
+    ".gltf": scene_files.read_gltf,
     ".obj": _read_obj,
     ".ply": _read_ply,
     ".stl": _read_stl,

@@ -21,7 +21,7 @@ from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_source import is_robot_folder
 from morphgen.rl.demonstrations.lerobot import is_data_set
 from morphgen.splits.split_file import split_names
-from morphgen.viewer import markup
+from morphgen.viewer import markup, robot_uri
 from morphgen.viewer.app.address import CHOSEN, Address, load_page, parse_address, parse_count
 from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.server import MessageFilter, access_policy, start_server, stop_server
@@ -29,14 +29,6 @@ from morphgen.viewer.app.session import BUG, DEFAULT_WIDTH, Session
 from morphgen.viewer.app.viser_internals import clear_page
 from morphgen.viewer.app.workers import SharedResults, Workers, named
 from morphgen.viewer.robot_files import change_tray
-from morphgen.viewer.robot_uri import (
-    CHECKPOINT,
-    EPISODE_SUFFIX,
-    WORDS,
-    FileAccess,
-    UriError,
-    resolve_words,
-)
 from morphgen.viewer.scene.stage import BRAND, set_stage
 
 NOTHING = "This address cannot be shown"  # title of the page for an address that cannot be shown
@@ -50,7 +42,7 @@ class Viewer:
 
     server: viser.ViserServer
     start: Address  # page for browsers whose URL names none
-    files: FileAccess
+    files: robot_uri.FileAccess
     workers: Workers
     simulator: Workers  # one process, in which rollouts run
     uploads: TemporaryDirectory[str]  # deleted with the viewer, at the latest when its process ends
@@ -89,13 +81,13 @@ def serve(
     targets = [Path(word).resolve() for word in words if "=" not in word and Path(word).exists()]
     folders = [path.parent if path.is_file() else path for path in targets]
     roots = tuple(dict.fromkeys((Path.cwd().resolve(), *folders)))
-    files = FileAccess(default_library(library).folders, roots, Path("/nowhere"))
+    files = robot_uri.FileAccess(default_library(library).folders, roots, Path("/nowhere"))
     files.library.names()  # reports a missing folder and broken parts before the server starts
     start = start_address(words, files)
     policy = access_policy(host, origins)
     _require_local_address(host)
     uploads = TemporaryDirectory(prefix="morphgen-uploads-", ignore_cleanup_errors=True)
-    files = FileAccess(files.library_folders, roots, Path(uploads.name).resolve())
+    files = robot_uri.FileAccess(files.library_folders, roots, Path(uploads.name).resolve())
     viewer: Viewer | None = None
 
     def receive(token: str, query: str) -> bool:
@@ -221,13 +213,13 @@ def _require_local_address(host: str) -> None:
         raise MorphgenError(f"cannot serve at {host!r}: {error.strerror or error}") from error
 
 
-def start_address(words: Sequence[str], files: FileAccess) -> Address:
+def start_address(words: Sequence[str], files: robot_uri.FileAccess) -> Address:
     """Return the page that ``morphgen view`` opens."""
     if not words:
         return Address("library")
     if len(words) > 1 or "=" in words[0]:
-        resolve_words(" ".join(words), files)
-        return Address("robot", (WORDS + " ".join(words),))
+        robot_uri.resolve_words(" ".join(words), files)
+        return Address("robot", (robot_uri.WORDS + " ".join(words),))
     word = words[0]
     if Path(word).exists():
         return _path_address(word, files)
@@ -237,25 +229,25 @@ def start_address(words: Sequence[str], files: FileAccess) -> Address:
         return Address("compose", (word,))
     parts = word.split("-")
     if parts[0] in files.library.paths:
-        resolve_words(word, files)  # raises if the parts cannot be joined
+        robot_uri.resolve_words(word, files)  # raises if the parts cannot be joined
         slots = [f"{files.library.manifest(part).kind}={part}" for part in parts]
-        return Address("robot", (WORDS + " ".join(slots),))
+        return Address("robot", (robot_uri.WORDS + " ".join(slots),))
     valid = (*split_names(), *grammar_names())
-    raise UriError(
+    raise robot_uri.UriError(
         f"{word}: no such file or folder, no robot such as ur5-plane, no split and no grammar"
         f"{nearest(word, valid)}; see morphgen list, split list and grammar list"
     )
 
 
-def _path_address(text: str, files: FileAccess) -> Address:
+def _path_address(text: str, files: robot_uri.FileAccess) -> Address:
     """Return the page of a file or folder."""
     path = files.path(text)
-    if path.suffix == EPISODE_SUFFIX:
+    if path.suffix == robot_uri.EPISODE_SUFFIX:
         from morphgen.viewer.episode import read_episode
 
         read_episode(path, files)
         return Address("play", (text,))
-    if path.suffix == ".pt" or (path / CHECKPOINT).is_file():
+    if path.suffix == ".pt" or (path / robot_uri.CHECKPOINT).is_file():
         from morphgen.rl.runs.checkpoint import read_checkpoint
 
         read_checkpoint(path)

@@ -27,19 +27,8 @@ from websockets.http11 import Request, Response
 from websockets.server import ServerProtocol
 
 from morphgen.errors import MorphgenError
+from morphgen.viewer.app import viser_internals
 from morphgen.viewer.app.frame import frame_page
-from morphgen.viewer.app.viser_internals import (
-    ACCEPTED_MESSAGES,
-    GuiUpdate,
-    Handler,
-    ScenePointer,
-    UploadPart,
-    UploadStart,
-    disable_share_links,
-    discard_upload,
-    input_handle,
-    replace_handlers,
-)
 
 LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")  # names of this machine that nobody else can claim
 _PORTS = {"http": 80, "https": 443}
@@ -191,7 +180,7 @@ def message_fault(data: object) -> str:
         content = msgspec.msgpack.decode(data)
         if not isinstance(content, dict) or not isinstance(content.get("type"), str):
             return "expected a message with a type"
-        message_type = ACCEPTED_MESSAGES.get(content.pop("type"))
+        message_type = viser_internals.ACCEPTED_MESSAGES.get(content.pop("type"))
         if message_type is None:
             return "this page accepts no message of that type"
         if not content.keys() <= {field.name for field in fields(message_type)}:
@@ -200,7 +189,7 @@ def message_fault(data: object) -> str:
     except (msgspec.MsgspecError, TypeError, ValueError, RecursionError) as error:
         return f"malformed message: {error}"
     # No page listens to clicks beside the nodes of its scene.
-    if message_type is ScenePointer and (
+    if message_type is viser_internals.ScenePointer and (
         content["event_type"] != "rect-select" or len(content["screen_pos"]) != 2
     ):
         return "expected a rectangle with two points"
@@ -217,16 +206,16 @@ class MessageFilter:
         """Replace viser's handlers of values for controls and of uploads."""
         self._client, self._report = client, report
         self._upload, self._rest = "", 0
-        own: dict[type[Any], Handler] = {
-            GuiUpdate: self.update,
-            UploadStart: self.start_upload,
-            UploadPart: self.receive_part,
+        own: dict[type[Any], viser_internals.Handler] = {
+            viser_internals.GuiUpdate: self.update,
+            viser_internals.UploadStart: self.start_upload,
+            viser_internals.UploadPart: self.receive_part,
         }
-        self._viser = replace_handlers(client, own)
+        self._viser = viser_internals.replace_handlers(client, own)
 
-    async def update(self, client_id: Any, message: GuiUpdate) -> None:  # noqa: ANN401
+    async def update(self, client_id: Any, message: viser_internals.GuiUpdate) -> None:  # noqa: ANN401
         """Set the value of a control."""
-        handle = input_handle(self._client, message.uuid)
+        handle = viser_internals.input_handle(self._client, message.uuid)
         if handle is None:
             return  # a control of the previous page
         if message.updates.keys() != {"value"}:
@@ -237,9 +226,9 @@ class MessageFilter:
         except MessageError as error:
             self._report(str(error))
         else:
-            await self._viser[GuiUpdate](client_id, message)
+            await self._viser[viser_internals.GuiUpdate](client_id, message)
 
-    def start_upload(self, client_id: Any, message: UploadStart) -> None:  # noqa: ANN401
+    def start_upload(self, client_id: Any, message: viser_internals.UploadStart) -> None:  # noqa: ANN401
         """Start an upload; an unfinished one is dropped, so a browser holds at most one."""
         self._drop_upload()
         reason, size, limit = "", message.size_bytes, MAX_UPLOAD // 2**20
@@ -255,9 +244,9 @@ class MessageFilter:
             self._report(f"{message.filename[:MAX_NAME]}: {reason}")
             return
         self._upload, self._rest = message.transfer_uuid, size
-        self._viser[UploadStart](client_id, message)
+        self._viser[viser_internals.UploadStart](client_id, message)
 
-    def receive_part(self, client_id: Any, message: UploadPart) -> None:  # noqa: ANN401
+    def receive_part(self, client_id: Any, message: viser_internals.UploadPart) -> None:  # noqa: ANN401
         """Receive a part of the current upload, at most as many bytes as were announced."""
         if message.transfer_uuid != self._upload:
             return
@@ -266,10 +255,10 @@ class MessageFilter:
             self._drop_upload()
             self._report("an upload was longer than its announced size; it was dropped")
             return
-        self._viser[UploadPart](client_id, message)
+        self._viser[viser_internals.UploadPart](client_id, message)
 
     def _drop_upload(self) -> None:
-        discard_upload(self._client, self._upload)
+        viser_internals.discard_upload(self._client, self._upload)
         self._upload = ""
 
 
@@ -370,7 +359,7 @@ def start_server(
     with _starting, _guarded(policy, receive), contextlib.redirect_stdout(io.StringIO()):
         # Silent, because viser's banner would name the port before ``morphgen view`` does.
         server = viser.ViserServer(host=host, port=port, verbose=False)
-    disable_share_links(server)
+    viser_internals.disable_share_links(server)
     loop = server.get_event_loop()
     loop.call_soon_threadsafe(loop.set_exception_handler, _print_fault)
     return server

@@ -19,19 +19,9 @@ from morphgen.formats.bundle import split_colours
 from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
-from morphgen.viewer import markup
+from morphgen.viewer import controls, markup
 from morphgen.viewer.app.address import MAX_COMPARED, Address
 from morphgen.viewer.app.session import Session
-from morphgen.viewer.controls import (
-    RoleSliders,
-    add_picker,
-    all_roles,
-    joint_roles,
-    normalized_positions,
-    picked_uri,
-    robot_lists,
-    with_roles,
-)
 from morphgen.viewer.robot_uri import UriError, read_robot_uri, uri_name, with_library_meshes
 from morphgen.viewer.scene import robot as scene_robot
 from morphgen.viewer.scene import stage as scene_stage
@@ -54,7 +44,7 @@ class ComparePage:
     uris: tuple[str, ...]
     robots: list[Robot]
     views: list[scene_robot.RobotView]
-    sliders: RoleSliders = field(init=False)
+    sliders: controls.RoleSliders = field(init=False)
     similarity: viser.GuiHtmlHandle = field(init=False)
 
 
@@ -132,13 +122,13 @@ def _without(uris: tuple[str, ...], i: int) -> tuple[str, ...]:
 
 def _add_picker(session: Session, uris: tuple[str, ...]) -> None:
     """Add controls that add a robot to the compared ones."""
-    lists = robot_lists(uris[0] if uris else "", session.files, {})
+    lists = controls.robot_lists(uris[0] if uris else "", session.files, {})
     with session.client.gui.add_folder("Add a robot"):
-        picker = add_picker(session, lists, lambda: uris[0] if uris else "")
+        picker = controls.add_picker(session, lists, lambda: uris[0] if uris else "")
         button = session.client.gui.add_button("Add", icon=viser.Icon.PLUS)
 
     def add() -> None:
-        session.open_address(Address("compare", (*uris, picked_uri(picker))))
+        session.open_address(Address("compare", (*uris, controls.picked_uri(picker))))
 
     session.on_change(picker.robot, add)
     session.on_change(button, add)
@@ -148,31 +138,33 @@ def _add_move_tab(page: ComparePage) -> None:
     """Add a slider for each role of joints, and buttons that move all of them."""
     session = page.session
     buttons = session.client.gui.add_button_group("Go to", ("home", "middle"))
-    sliders = page.sliders = RoleSliders(session, -1.0, lambda: _move(page))
-    roles = all_roles(page.robots)
+    sliders = page.sliders = controls.RoleSliders(session, -1.0, lambda: _move(page))
+    roles = controls.all_roles(page.robots)
 
     def go_to_target() -> None:
         sliders.set({} if buttons.value == "home" else dict.fromkeys(roles, 0.0))
 
     session.on_change(buttons, go_to_target)
     for role in roles:
-        names = ", ".join(robot.name for robot in page.robots if role in joint_roles(robot))
+        names = ", ".join(
+            robot.name for robot in page.robots if role in controls.joint_roles(robot)
+        )
         hint = f"-1 is the lower limit, 1 the upper; of {names}"
         sliders.add(role, _home_value(page, role), hint)
 
 
 def _home_value(page: ComparePage, role: str) -> float:
     """Return a role's normalized home position of the first robot that has the role."""
-    robot = next(robot for robot in page.robots if role in joint_roles(robot))
-    home = normalized_positions(robot, np.array(robot.home))
-    return float(np.clip(home[joint_roles(robot).index(role)], -1, 1))
+    robot = next(robot for robot in page.robots if role in controls.joint_roles(robot))
+    home = controls.normalized_positions(robot, np.array(robot.home))
+    return float(np.clip(home[controls.joint_roles(robot).index(role)], -1, 1))
 
 
 def _move(page: ComparePage) -> None:
     """Move every robot: moved roles to their positions, other joints to their home."""
     with page.session.client.atomic():
         for robot, view in zip(page.robots, page.views, strict=True):
-            q = with_roles(robot, np.array(robot.home), page.sliders.moved)
+            q = controls.with_roles(robot, np.array(robot.home), page.sliders.moved)
             view.set_configuration(q)
     page.session.show_state_later()
 

@@ -24,18 +24,6 @@ from morphgen.viewer.app.uploads import store_upload
 from morphgen.viewer.app.workers import WorkerDied
 from morphgen.viewer.controls import bind
 from morphgen.viewer.robot_files import Thumbnail, make_thumbnail, thumbnail_of_picture
-from morphgen.viewer.robot_rows import (
-    FILTERS,
-    UNITS,
-    WORDS_OF_ROWS,
-    Row,
-    folder_rows,
-    part_rows,
-    passes,
-    robot_folders,
-    robot_subfolders,
-    uri_rows,
-)
 from morphgen.viewer.robot_uri import DEFAULT_WORDS, FileAccess
 from morphgen.viewer.splits import SPLITS, ChooseSides, add_split_form
 
@@ -125,9 +113,9 @@ def add_filter(gallery: Gallery) -> None:
     gallery.controls["search"] = gui.add_text("Search", "")
     bind(session, "search", gallery.controls["search"])
     _add_dropdown(gallery, "sort", "Sort by", _SORTS)
-    is_filtered = not session.address.state.keys().isdisjoint({*FILTERS[1:], "size"})
+    is_filtered = not session.address.state.keys().isdisjoint({*robot_rows.FILTERS[1:], "size"})
     with gui.add_folder("Filter", expand_by_default=is_filtered):
-        for key in WORDS_OF_ROWS:
+        for key in robot_rows.WORDS_OF_ROWS:
             choices = (_ALL, *robot_rows.fact_choices(gallery.rows, key))
             label = _role_name(gallery) if key == "role" else key
             _add_dropdown(gallery, key, label.capitalize(), choices)
@@ -140,12 +128,14 @@ def add_filter(gallery: Gallery) -> None:
 def passing_rows(gallery: Gallery) -> list[robot_rows.Row]:
     """Return the robots that pass the filter, on all pages, in the order of the set."""
     state = gallery.session.state()
-    return robot_rows.sort_rows((row for row in gallery.rows if passes(row, state)), "order")
+    return robot_rows.sort_rows(
+        (row for row in gallery.rows if robot_rows.passes(row, state)), "order"
+    )
 
 
 def clear_filter(gallery: Gallery, key: str) -> None:
     """Let every robot pass a condition of the filter, or all conditions without a key."""
-    for name in (key,) if key else FILTERS:
+    for name in (key,) if key else robot_rows.FILTERS:
         if (control := gallery.controls.get(name)) is None:
             continue
         if name in robot_rows.NUMBERS:
@@ -158,9 +148,9 @@ def empty_text(gallery: Gallery) -> str:
     """Return what excludes all robots, as HTML with links that clear each condition."""
     lines = []
     for key, value in gallery.session.state().items():
-        if key not in FILTERS or not value:
+        if key not in robot_rows.FILTERS or not value:
             continue
-        alone = sum(passes(row, {key: value}) for row in gallery.rows)
+        alone = sum(robot_rows.passes(row, {key: value}) for row in gallery.rows)
         count = "no robot" if not alone else "1 robot" if alone == 1 else f"{alone} robots"
         name = _LABELS.get(key, key)
         clear = f'<a data-do="clear filter" data-value="{key}">clear</a>'
@@ -199,7 +189,8 @@ def parse_range(
     if low > limits[1] + robot_rows.ROUNDING or high < limits[0] - robot_rows.ROUNDING:
         ends = " to ".join(dict.fromkeys(f"{end:.4g}" for end in limits))
         raise AddressError(
-            f"{where} excludes every robot, so it was left out: they have {ends} {UNITS[fact]}"
+            f"{where} excludes every robot, so it was left out: they have {ends} "
+            f"{robot_rows.UNITS[fact]}"
         )
     return max(low, limits[0]), min(high, limits[1])
 
@@ -225,7 +216,7 @@ def _role_name(gallery: Gallery) -> str:
 def _sort_label(gallery: Gallery, key: str) -> str:
     """Return the text of an order, such as ``reach, largest first``."""
     name = key.removeprefix("-")
-    last = {"order": "last first"} | dict.fromkeys(("name", *WORDS_OF_ROWS), "Z to A")
+    last = {"order": "last first"} | dict.fromkeys(("name", *robot_rows.WORDS_OF_ROWS), "Z to A")
     text = _role_name(gallery) if name == "role" else name
     return f"{text}, {last.get(name, 'largest first')}" if key != name else text
 
@@ -259,7 +250,7 @@ def _add_range(gallery: Gallery, fact: str) -> None:
 REFRESH_INTERVAL = 0.6  # time after which a gallery shows the thumbnails drawn meanwhile [s]
 
 
-def load_bundle_pictures(gallery: Gallery, rows: Iterable[Row]) -> None:
+def load_bundle_pictures(gallery: Gallery, rows: Iterable[robot_rows.Row]) -> None:
     """Load the pictures that bundles have, for robots whose facts are known."""
     for row in rows:
         if row.uri in gallery.thumbnails or ":" in row.uri:
@@ -271,7 +262,7 @@ def load_bundle_pictures(gallery: Gallery, rows: Iterable[Row]) -> None:
 
 
 def load_pictures(
-    gallery: Gallery, rows: Sequence[Row], is_wanted: Callable[[], bool] = lambda: True
+    gallery: Gallery, rows: Sequence[robot_rows.Row], is_wanted: Callable[[], bool] = lambda: True
 ) -> None:
     """Load or draw the pictures that rows lack while they are wanted.
 
@@ -285,7 +276,9 @@ def load_pictures(
         _request_missing(gallery, rows, is_wanted)
 
 
-def _request_missing(gallery: Gallery, rows: Sequence[Row], is_wanted: Callable[[], bool]) -> None:
+def _request_missing(
+    gallery: Gallery, rows: Sequence[robot_rows.Row], is_wanted: Callable[[], bool]
+) -> None:
     """Draw missing thumbnails in the workers, and show them as they arrive."""
     session, workers = gallery.session, gallery.session.workers
     pending = {}
@@ -314,7 +307,7 @@ def _store_thumbnail(gallery: Gallery, uri: str, thumbnail: Thumbnail) -> None:
         rows[:] = [_completed(row, facts) if row.uri == uri else row for row in rows]
 
 
-def _completed(row: Row, facts: Mapping[str, Any]) -> Row:
+def _completed(row: robot_rows.Row, facts: Mapping[str, Any]) -> robot_rows.Row:
     """Return a row with the facts that it lacks, and with the findings of the robot itself."""
     return replace(
         row, **{k: v for k, v in facts.items() if k == "findings" or getattr(row, k) is None}
@@ -418,7 +411,7 @@ NONE_CHOSEN = (
 
 def show_library(session: Session) -> None:
     """Build the first page: all parts, links to everything else, and the upload button."""
-    gallery = Gallery(session, "Parts", part_rows(session.files.library), noun="part")
+    gallery = Gallery(session, "Parts", robot_rows.part_rows(session.files.library), noun="part")
     open_panels(gallery, "", INTRODUCTION + section_links(session.files))
     upload = session.client.gui.add_upload_button(
         "Open a URDF, an MJCF or a zip", icon=viser.Icon.UPLOAD
@@ -443,9 +436,9 @@ def show(session: Session) -> None:
         show_index(session)
         return
     folder = session.address.subject
-    rows = folder_rows(folder, session.files)
+    rows = robot_rows.folder_rows(folder, session.files)
     gallery = Gallery(session, folder, rows)
-    names = robot_subfolders(session.files.path(folder))
+    names = robot_rows.robot_subfolders(session.files.path(folder))
     below = [f"{folder.rstrip('/')}/{name}" for name in names]
     links = " · ".join(markup.link(Address("gallery", (path,)), path) for path in below)
     population = markup.link(Address("population", (folder,)), "see all on one ground")
@@ -457,8 +450,8 @@ def show(session: Session) -> None:
 
 
 def choose_sides(
-    rows: list[Row], passing: list[Row], num_train: int, num_test: int
-) -> tuple[list[Row], list[Row]]:
+    rows: list[robot_rows.Row], passing: list[robot_rows.Row], num_train: int, num_test: int
+) -> tuple[list[robot_rows.Row], list[robot_rows.Row]]:
     """Return the first rows that pass the filter (train) and the first that do not (test)."""
     uris = {row.uri for row in passing}
     failing = [row for row in rows if row.uri not in uris]
@@ -484,7 +477,7 @@ def show_chosen(session: Session) -> None:
     """Build the page of the chosen robots, which become the two sides of a new split."""
     if not session.chosen:
         raise MorphgenError(NONE_CHOSEN)
-    rows = uri_rows(session.chosen, session.files)
+    rows = robot_rows.uri_rows(session.chosen, session.files)
     gallery = Gallery(session, "Chosen robots", rows, SIDES)
     header = "The first robots that you chose are to train on, the others to test on."
     open_panels(gallery, markup.breadcrumbs(("chosen robots", None)), markup.dim(header))
@@ -497,7 +490,7 @@ def show_chosen(session: Session) -> None:
         _set_sides(gallery.rows, num_train.value)
         show_page(gallery, 1)
 
-    def sides() -> tuple[list[Row], list[Row]]:
+    def sides() -> tuple[list[robot_rows.Row], list[robot_rows.Row]]:
         return gallery.rows[: num_train.value], gallery.rows[num_train.value :]
 
     def leave_out() -> None:
@@ -510,7 +503,7 @@ def show_chosen(session: Session) -> None:
     session.on_choice = leave_out
 
 
-def _set_sides(rows: list[Row], num_train: int) -> None:
+def _set_sides(rows: list[robot_rows.Row], num_train: int) -> None:
     """Give rows their sides: the first ones are to train on."""
     rows[:] = [replace(row, role=SIDES[int(i >= num_train)]) for i, row in enumerate(rows)]
 
@@ -556,7 +549,7 @@ def section_links(files: FileAccess, page: str = "library") -> str:
             "none yet: compose a robot and write it to robots/, or run "
             "<code>morphgen sample arm3</code>"
         )
-        robots = robot_folders(root)
+        robots = robot_rows.robot_folders(root)
         html += section("Robots in this folder", robots, ("gallery", "population"), empty)
     empty = "none yet: choose robots in a gallery, then press split"
     html += section("Splits", [*own, *split_names()], ("split", "population"), empty)

@@ -19,22 +19,13 @@ from morphgen.rl.shipped_policies import is_named, policies_for, zero_shot_polic
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.task import TaskConfig
 from morphgen.typing import Array
-from morphgen.viewer import markup
+from morphgen.viewer import markup, rollout
 from morphgen.viewer.app.address import MAX_PLAYED, Address, AddressError
 from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.app.workers import named
 from morphgen.viewer.controls import Robots, add_picker, bind, picked_uri, robot_lists
 from morphgen.viewer.episode import Episode, episode_bytes, read_episode, score_until, snapshot
 from morphgen.viewer.robot_uri import DEFAULT_WORDS, EPISODE_SUFFIX, WORDS, FileAccess, uri_name
-from morphgen.viewer.rollout import (
-    SPEEDS,
-    EpisodeSource,
-    Player,
-    RemoteRollout,
-    RolloutConfig,
-    list_checkpoints,
-    simulation,
-)
 from morphgen.viewer.scene.rollout import RolloutScene, add_episode, episode_page, show_step
 from morphgen.viewer.scene.stage import look_at
 
@@ -59,7 +50,7 @@ def show(session: Session) -> None:
         session.client.gui.add_html(markup.framed(describe_episode(episode)))
         session.title = f"play {uri_name(subject)}"
         session.apply_state()
-        page.load(lambda: EpisodeSource(episode, episode.num_steps))
+        page.load(lambda: rollout.EpisodeSource(episode, episode.num_steps))
     else:
         trained_on = complete_address(session)
         if (task := session.address.subject) not in TASKS:
@@ -86,9 +77,9 @@ class PlayPage:
     def __init__(self, session: Session) -> None:
         """Add the controls of the playback."""
         gui, self.session = session.client.gui, session
-        self.player = Player(self)
+        self.player = rollout.Player(self)
         session.on_close(self.player.stop)
-        self._source: EpisodeSource | None = None
+        self._source: rollout.EpisodeSource | None = None
         self._scene: RolloutScene | None = None
         self._framed: tuple[str, ...] = ()  # URIs of the robots that the camera was pointed at
         self._is_planning = False  # whether the policy is still planning its first step
@@ -98,7 +89,7 @@ class PlayPage:
         self._charts: list[viser.GuiUplotHandle] = []  # of distance and score
         self._fault = gui.add_html("")
         buttons = gui.add_button_group("Episode", ("play", "pause", "back", "step"))
-        speeds = tuple(f"{speed:g}x" for speed in SPEEDS)
+        speeds = tuple(f"{speed:g}x" for speed in rollout.SPEEDS)
         speed = gui.add_dropdown("speed", speeds, initial_value="1x")
         hint = "as far as it was simulated"
         self._time = gui.add_slider("time (s)", 0.0, 6.0, 0.02, 0.0, hint=hint)
@@ -116,13 +107,13 @@ class PlayPage:
         session.on_change(self._time, self._go_to_time, "time")
         session.keep("t", self._write_time, self._apply_time)
 
-    def load(self, make_source: Callable[[], EpisodeSource]) -> None:
+    def load(self, make_source: Callable[[], rollout.EpisodeSource]) -> None:
         """Show the state in the address, and let the player show an episode."""
         self._position = None
         self.session.show_state()
         start, self._start = self._start, None
 
-        def load() -> EpisodeSource:  # on the player's thread, which also removes scenes
+        def load() -> rollout.EpisodeSource:  # on the player's thread, which also removes scenes
             if self._scene is not None:  # not the pose of another seed until the new start is there
                 self._scene.root.visible = False
             return make_source()
@@ -159,13 +150,13 @@ class PlayPage:
         def restart() -> None:
             # Those that the address asks for in vain can be switched off.
             obstacles.visible = obstacles.value or has_obstacles(task.value)
-            config = RolloutConfig(
+            config = rollout.RolloutConfig(
                 task.value, robots, policy.value, seed.value, obstacles.value, simulator.value
             )
             session.address = replace(session.address, subjects=(task.value,), robots=robots)
             session.title = f"{task.value} {uri_name(robots[0])}"
             session.set_status(f"preparing {', '.join(map(uri_name, robots))}")
-            self.load(lambda: RemoteRollout(config, session.files, session.simulator))
+            self.load(lambda: rollout.RemoteRollout(config, session.files, session.simulator))
 
         def start_next() -> None:
             set_value(seed, seed.value + 1)
@@ -229,7 +220,7 @@ class PlayPage:
                 button = gui.add_button(label, icon=viser.Icon.DOWNLOAD)
                 session.on_press(button, functools.partial(send, suffix, make))
 
-    def show_start(self, source: EpisodeSource) -> None:
+    def show_start(self, source: rollout.EpisodeSource) -> None:
         """Show a new episode at its start."""
         client, self._source, episode = self.session.client, source, source.episode
         with client.atomic():
@@ -248,7 +239,7 @@ class PlayPage:
             self._charts = add_charts(client.gui, episode, dark=self.session.dark)
         self._time.max = max(source.max_steps, 1) * episode.period
         self._show_faults(source.faults.values())
-        self._is_planning = isinstance(source, RemoteRollout) and episode.policy in PLANNERS
+        self._is_planning = isinstance(source, rollout.RemoteRollout) and episode.policy in PLANNERS
         self.session.set_status("the policy plans its path" if self._is_planning else "")
 
     def show_step(self, step: int) -> None:
@@ -336,7 +327,7 @@ def complete_address(session: Session) -> Robots:
     policy = session.address.state.get("policy", "")
     if not policy or is_named(policy):
         return []
-    find_robots = simulation("training_robots")
+    find_robots = rollout.simulation("training_robots")
     task, obstacles, trained_on = session.simulator.call(find_robots, policy, session.files)
     if not session.address.subject:
         address = replace(session.address, subjects=(task,))
@@ -346,7 +337,7 @@ def complete_address(session: Session) -> Robots:
 
 def _policies(files: FileAccess, task: str, policy: str) -> tuple[str, ...]:
     """Return the task's baselines and shipped policies, the folder's checkpoints and the policy."""
-    return tuple(dict.fromkeys((*policies_for(task), *list_checkpoints(files), policy)))
+    return tuple(dict.fromkeys((*policies_for(task), *rollout.list_checkpoints(files), policy)))
 
 
 def parse_time(text: str) -> float:

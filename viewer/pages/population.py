@@ -34,7 +34,7 @@ from morphgen.progress import report
 from morphgen.splits.split import SIDES, split_id
 from morphgen.splits.split_file import split_names
 from morphgen.typing import Array
-from morphgen.viewer import markup
+from morphgen.viewer import markup, robot_uri
 from morphgen.viewer.app.address import Address, parse_count
 from morphgen.viewer.app.session import Session
 from morphgen.viewer.app.workers import Workers
@@ -42,31 +42,8 @@ from morphgen.viewer.controls import RoleSliders, all_roles, bind, joint_roles
 from morphgen.viewer.pages.gallery import show_index
 from morphgen.viewer.robot_rows import UNITS, Row, facts_line, folder_rows, sort_rows, split_rows
 from morphgen.viewer.robot_tables import has_tool
-from morphgen.viewer.robot_uri import (
-    DERIVATION,
-    FileAccess,
-    UriError,
-    content_hash,
-    read_robot_uri,
-    resolve_grammar,
-    resolve_split,
-)
+from morphgen.viewer.scene import stage
 from morphgen.viewer.scene.robot import robot_bounds
-from morphgen.viewer.scene.stage import (
-    SHARP_ANGLE,
-    Rgb,
-    Triangles,
-    add_ground,
-    add_scale_bar,
-    background_colour,
-    batch_colours,
-    camera_view,
-    look_at,
-    mesh_arrays,
-    project_points,
-    shape_colour,
-    triangles,
-)
 
 UNIT_BOX, UNIT_CYLINDER, UNIT_SPHERE = Box((1.0, 1.0, 1.0)), Cylinder(0.5, 1.0), Sphere(0.5)
 """Primitives of which the others are scaled copies; their bounding boxes have edges of 1 m."""
@@ -143,12 +120,12 @@ def make_population(read: Sequence[ReadRobot]) -> Population:
 
 def make_instances(robots: Sequence[Robot]) -> Instances:
     """Collect the visual shapes of robots, or the collision shapes of links without any."""
-    members: dict[Prototype, list[tuple[int, int, Array, Array, Rgb]]] = {}
+    members: dict[Prototype, list[tuple[int, int, Array, Array, stage.Rgb]]] = {}
     for i, robot in enumerate(robots):
         for j, link in enumerate(robot.links):
             for shape in link.visuals or link.collisions:
                 for prototype, pose, scale in _copies(shape):
-                    row = (i, j, pose.matrix, scale, shape_colour(shape))
+                    row = (i, j, pose.matrix, scale, stage.shape_colour(shape))
                     members.setdefault(prototype, []).append(row)
     prototypes, start = {}, 0
     for prototype, rows in members.items():
@@ -228,7 +205,7 @@ class PopulationScene:
                 batched_wxyzs=wxyzs[part],
                 batched_positions=origins[part],
                 batched_scales=instances.scale[part],
-                batched_colors=batch_colours(instances.colour[part]),
+                batched_colors=stage.batch_colours(instances.colour[part]),
                 lod="auto" if is_mesh else "off",
                 cast_shadow=len(population) <= MAX_SHADOWS,
                 side="double" if is_mesh else "front",  # some meshes have their faces inside out
@@ -247,7 +224,7 @@ class PopulationScene:
             for handle, part in self.parts():
                 handle.batched_wxyzs, handle.batched_positions = wxyzs[part], origins[part]
 
-    def fade(self, selected: NDArray[np.bool_], background: Rgb) -> None:
+    def fade(self, selected: NDArray[np.bool_], background: stage.Rgb) -> None:
         """Fade the robots that are not in a selection (n,), unless it is empty."""
         instances = self.population.instances
         colours = instances.colour.astype(np.float64)
@@ -256,7 +233,7 @@ class PopulationScene:
             colours = np.where(selected[instances.robot][:, None], colours, faded)
         with self._client.atomic():
             for handle, part in self.parts():
-                handle.batched_colors = batch_colours(colours[part])
+                handle.batched_colors = stage.batch_colours(colours[part])
 
     def _poses(self, q: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return rotations (w, x, y, z) and positions of all instances in the world."""
@@ -266,23 +243,23 @@ class PopulationScene:
         return wxyzs, poses[:, :3, 3]
 
 
-def surface(prototype: Prototype) -> Triangles:
+def surface(prototype: Prototype) -> stage.Triangles:
     """Return the surface of a prototype, simplified because it is drawn many times."""
     match prototype:
         case Box():
-            return triangles(prototype)
+            return stage.triangles(prototype)
         case Sphere(radius):
             ball = trimesh.creation.icosphere(subdivisions=_SPHERE_SUBDIVISIONS, radius=radius)
-            return mesh_arrays(ball)
+            return stage.mesh_arrays(ball)
         case Cylinder(radius, length):
             tube = trimesh.creation.cylinder(radius, length, sections=_CYLINDER_SECTIONS)
-            return mesh_arrays(trimesh.graph.smooth_shade(tube, angle=SHARP_ANGLE))
+            return stage.mesh_arrays(trimesh.graph.smooth_shade(tube, angle=stage.SHARP_ANGLE))
         case Mesh() as mesh:
             loaded = load_mesh(mesh)
             if len(loaded.faces) <= MAX_FACES:
-                return triangles(mesh)
+                return stage.triangles(mesh)
             simple = loaded.simplify_quadric_decimation(face_count=MAX_FACES)
-            return mesh_arrays(trimesh.graph.smooth_shade(simple, angle=SHARP_ANGLE))
+            return stage.mesh_arrays(trimesh.graph.smooth_shade(simple, angle=stage.SHARP_ANGLE))
 
 
 MAX_ROBOTS = 1000  # largest population [robots]
@@ -311,33 +288,33 @@ class Source:
         return f"{hash(self)}"
 
 
-def find_source(subject: str, files: FileAccess, seed: int, number: int) -> Source:
+def find_source(subject: str, files: robot_uri.FileAccess, seed: int, number: int) -> Source:
     """List the robots that an address names."""
     name, at, side = subject.rpartition("@")
     if not at:
         name, side = subject, ""
     elif side not in SIDES:
-        raise UriError(f"{subject}: unknown side {side!r}; expected @train or @test")
+        raise robot_uri.UriError(f"{subject}: unknown side {side!r}; expected @train or @test")
     if name in grammar_names() or name.endswith(SUFFIX):
         number = min(max(number, 1), MAX_ROBOTS)
-        grammar = resolve_grammar(name, files)
+        grammar = robot_uri.resolve_grammar(name, files)
         names = [robot_name(grammar, i) for i in range(number)]
         rows = [Row(text, text, grammar.name, order=i) for i, text in enumerate(names)]
         return Source(tuple(rows), number, name, seed, grammar_text(grammar))
     if name in split_names() or name.endswith(".yaml") or (files.path(name) / SPLIT_FILE).is_file():
-        split = resolve_split(name, files)
+        split = robot_uri.resolve_split(name, files)
         rows = [row for row in split_rows(name, split) if side in ("", row.role)]
         stamp = split_id(split)
     elif side:
-        raise UriError(f"{subject}: only a split has sides; {name} is a folder")
+        raise robot_uri.UriError(f"{subject}: only a split has sides; {name} is a folder")
     else:
         rows = folder_rows(name, files)
-        stamp = "\n".join(content_hash(row.uri, files) for row in rows[:MAX_ROBOTS])
+        stamp = "\n".join(robot_uri.content_hash(row.uri, files) for row in rows[:MAX_ROBOTS])
     return Source(tuple(rows[:MAX_ROBOTS]), len(rows), stamp=stamp)
 
 
 def load_population(
-    source: Source, files: FileAccess, workers: Workers
+    source: Source, files: robot_uri.FileAccess, workers: Workers
 ) -> tuple[Population, list[tuple[str, str]]]:
     """Read the robots in the workers; return also the name and error of those that are broken."""
     chunks = [source.rows[i : i + _CHUNK] for i in range(0, len(source.rows), _CHUNK)]
@@ -352,26 +329,26 @@ def load_population(
     faults = [result for result in results if not isinstance(result, ReadRobot)]
     read = [result for result in results if isinstance(result, ReadRobot)]
     if not read:
-        raise UriError(f"no robot can be read; the first error: {faults[0][1]}")
+        raise robot_uri.UriError(f"no robot can be read; the first error: {faults[0][1]}")
     return make_population(read), faults
 
 
 def read_robots(
-    rows: Sequence[Row], files: FileAccess, grammar_name: str = "", seed: int = 0
+    rows: Sequence[Row], files: robot_uri.FileAccess, grammar_name: str = "", seed: int = 0
 ) -> list[ReadRobot | tuple[str, str]]:
     """Read or sample robots and measure what their rows lack, or return name and error of each.
 
     Runs in a worker.
     """
-    grammar = resolve_grammar(grammar_name, files) if grammar_name else None
+    grammar = robot_uri.resolve_grammar(grammar_name, files) if grammar_name else None
     results: list[ReadRobot | tuple[str, str]] = []
     for row in rows:
         try:
             if grammar is None:
-                robot = read_robot_uri(row.uri, files)
+                robot = robot_uri.read_robot_uri(row.uri, files)
             else:
                 sample = sample_robot(grammar, files.library, row.order, seed=seed)
-                robot, uri = sample.robot, f"{DERIVATION}{sample.derivation}"
+                robot, uri = sample.robot, f"{robot_uri.DERIVATION}{sample.derivation}"
                 codes = sorted({finding.code for finding in sample.findings})
                 row = replace(row, uri=uri, findings=tuple(codes))
             robot = split_colours(robot)
@@ -532,7 +509,7 @@ class PopulationPage:
     def select(self, selected: NDArray[np.bool_]) -> None:
         """Select robots by a mask (n,), in the scene, the panel and the address."""
         self.selected = selected
-        self.scene.fade(selected, background_colour(dark=self.session.dark))
+        self.scene.fade(selected, stage.background_colour(dark=self.session.dark))
         self._selection.content = markup.framed(selection_text(self._selected_rows))
         self.session.show_state()
 
@@ -550,7 +527,9 @@ class PopulationPage:
     def _choose(self) -> None:
         """Put the selected robots into the tray."""
         if not self._selected_rows:
-            raise UriError("no robot is selected: drag a rectangle with the shift key held")
+            raise robot_uri.UriError(
+                "no robot is selected: drag a rectangle with the shift key held"
+            )
         uris = (row.uri for row in self._selected_rows)
         self.session.choose((*self.session.chosen, *uris))
 
@@ -592,9 +571,9 @@ class PopulationPage:
                 client.scene.add_label(f"/labels/{i}", text, position=(*position, 0.0))
                 for i, (text, position) in enumerate(labels)
             ]
-            add_ground(client.scene, float(np.linalg.norm(high - low)))
-            add_scale_bar(client.scene, low, high, CAMERA_DIRECTION)
-            look_at(client, low, high, CAMERA_DIRECTION)
+            stage.add_ground(client.scene, float(np.linalg.norm(high - low)))
+            stage.add_scale_bar(client.scene, low, high, CAMERA_DIRECTION)
+            stage.look_at(client, low, high, CAMERA_DIRECTION)
         self.session.show_state()
 
     def _connect_pointer(self) -> None:
@@ -616,11 +595,11 @@ class PopulationPage:
 
     def _inside(self, event: viser.SceneRectSelectEvent) -> NDArray[np.bool_]:
         """Return which robots have their middle inside a rectangle of the picture, shape (n,)."""
-        view = camera_view(self.session.client)
+        view = stage.camera_view(self.session.client)
         corners = np.array([event.screen_min, event.screen_max]) * (view.aspect, 1.0)
         centres = self.population.home_bounds.mean(axis=1)
         centres[:, :2] += self.scene.positions
-        points, depth = project_points(view, centres)
+        points, depth = stage.project_points(view, centres)
         inside = (points >= corners.min(axis=0)) & (points <= corners.max(axis=0))
         return np.asarray(inside.all(axis=1) & (depth > 0))
 

@@ -20,22 +20,13 @@ from morphgen.errors import MorphgenError
 from morphgen.fitting.replace_collision import as_primitives, stored_primitives
 from morphgen.formats.bundle import CARD, MJCF, URDF, file_findings, split_colours
 from morphgen.formats.fits import read_stored_fits
+from morphgen.model import kinematics
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Pose, Shape
-from morphgen.model.kinematics import (
-    arm_reach,
-    driving_joints,
-    forward_kinematics,
-    frame_pose,
-    joint_limits,
-    link_jacobians,
-    random_configurations,
-    solve_pose_ik,
-)
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
-from morphgen.viewer import markup, robot_tables
+from morphgen.viewer import markup, robot_tables, robot_uri
 from morphgen.viewer.app.address import Address, parse_count
 from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.session import Session, set_value
@@ -46,15 +37,6 @@ from morphgen.viewer.controls import bind
 from morphgen.viewer.robot_files import bundle_files, zip_files
 from morphgen.viewer.robot_rows import neighbour_uris
 from morphgen.viewer.robot_tables import has_tool
-from morphgen.viewer.robot_uri import (
-    UPLOAD,
-    WORDS,
-    member_split,
-    parent_folder,
-    read_robot_uri,
-    uri_name,
-    with_library_meshes,
-)
 from morphgen.viewer.scene import overlays as scene_overlays
 from morphgen.viewer.scene import robot as scene_robot
 from morphgen.viewer.scene import stage as scene_stage
@@ -72,15 +54,15 @@ _MAX_TURN = 0.4  # largest such step [rad or m]
 def show(session: Session) -> None:
     """Build the page of the robot that the address names."""
     uri = session.address.subject
-    session.open_panel(PANEL_WIDTH, _location(session, uri), f"reading {uri_name(uri)}")
-    page = RobotPage(session, uri, split_colours(read_robot_uri(uri, session.files)))
+    session.open_panel(PANEL_WIDTH, _location(session, uri), f"reading {robot_uri.uri_name(uri)}")
+    page = RobotPage(session, uri, split_colours(robot_uri.read_robot_uri(uri, session.files)))
     session.set_status("")
     session.run_in_background(page.check)
 
 
 def summary(robot: Robot, links: str) -> str:
     """Return a robot's name and facts, followed by links as HTML."""
-    distance = arm_reach(robot) if has_tool(robot) and robot.dof else None
+    distance = kinematics.arm_reach(robot) if has_tool(robot) and robot.dof else None
     facts = robot_tables.summary(robot, distance)
     return markup.framed(
         f"<h3>{escape(robot.name)}</h3>",
@@ -91,9 +73,9 @@ def summary(robot: Robot, links: str) -> str:
 def _location(session: Session, uri: str) -> str:
     """Return breadcrumbs to the robot's set or split, with links to its neighbours there."""
     steps: list[tuple[str, Address | None]] = []
-    if split := member_split(uri):
+    if split := robot_uri.member_split(uri):
         steps.append((split, Address("split", (split,))))
-    elif folder := parent_folder(uri):
+    elif folder := robot_uri.parent_folder(uri):
         steps.append((folder, Address("gallery", (folder,))))
     previous, following = neighbour_uris(uri, session.files)
     links = [
@@ -102,14 +84,14 @@ def _location(session: Session, uri: str) -> str:
         if neighbour
     ]
     neighbours = markup.dim(" · ".join(links)) if links else ""
-    return markup.breadcrumbs(*steps, (uri_name(uri), None)) + markup.framed(neighbours)
+    return markup.breadcrumbs(*steps, (robot_uri.uri_name(uri), None)) + markup.framed(neighbours)
 
 
 def _links(robot: Robot, uri: str) -> str:
     """Return links to what can be done with a robot, as HTML."""
     links = [markup.choose_box(uri, "choose")]
     if robot.provenance.get("derivation"):
-        target = Address("compose", (uri.removeprefix(WORDS),))
+        target = Address("compose", (uri.removeprefix(robot_uri.WORDS),))
         links.append(markup.link(target, "Edit in Compose"))
     links.append(markup.link(Address("compare", (uri,)), "compare"))
     if has_tool(robot) and robot.dof:
@@ -219,7 +201,7 @@ class RobotPage:
         for folder in self._folders:
             folder.remove()
         self._folders = []
-        sliders, limits = {}, joint_limits(robot)
+        sliders, limits = {}, kinematics.joint_limits(robot)
         for group in robot_tables.joint_groups(robot):
             with self._slider_box:
                 self._folders.append(folder := gui.add_folder(group.title))
@@ -254,10 +236,10 @@ class RobotPage:
         """Move the robot to a configuration: ``home``, ``zero`` or ``random``."""
         robot = self.robot
         if target == "random":
-            (q,) = random_configurations(robot, 1, np.random.default_rng())
+            (q,) = kinematics.random_configurations(robot, 1, np.random.default_rng())
         else:
             q = np.array(robot.home) if target == "home" else np.zeros(robot.dof)
-        self.move(np.clip(q, *joint_limits(robot).T))
+        self.move(np.clip(q, *kinematics.joint_limits(robot).T))
 
     def select(self, name: str) -> None:
         """Select a link: outline, card and slider; an empty name selects none."""
@@ -374,12 +356,14 @@ def turn_towards(robot: Robot, q: Array, row: int, link: int, point: Array, targ
 
     The point is in the link's frame, the target in the root frame, shape (3,) each [m].
     """
-    q, (low, high) = q.copy(), joint_limits(robot)[row]
+    q, (low, high) = q.copy(), kinematics.joint_limits(robot)[row]
     column = robot.mimic_map[0][:, row]
     for _ in range(_DRAG_ROUNDS):
-        T_root_link = forward_kinematics(robot, q)
+        T_root_link = kinematics.forward_kinematics(robot, q)
         position = T_root_link[link, :3, :3] @ point + T_root_link[link, :3, 3]
-        linear, angular = (link_jacobians(robot, T_root_link)[link] @ column).reshape(2, 3)
+        linear, angular = (kinematics.link_jacobians(robot, T_root_link)[link] @ column).reshape(
+            2, 3
+        )
         velocity = linear + np.cross(angular, position)
         square = float(velocity @ velocity)
         if square < 1e-12:  # the point is on the joint's axis
@@ -392,7 +376,7 @@ def turn_towards(robot: Robot, q: Array, row: int, link: int, point: Array, targ
 def joint_of_link(robot: Robot, link: int) -> int | None:
     """Return the index in q of the joint nearest above a link that moves it; None for the base."""
     while link:
-        if rows := driving_joints(robot, (link - 1,)):
+        if rows := kinematics.driving_joints(robot, (link - 1,)):
             return rows[0]
         link = robot.parents[link]
     return None
@@ -411,7 +395,7 @@ def parse_joints(text: str, robot: Robot) -> Array | None:
         return None
     if q.shape != (robot.dof,) or not np.isfinite(q).all():
         return None
-    return np.asarray(np.clip(q, *joint_limits(robot).T))
+    return np.asarray(np.clip(q, *kinematics.joint_limits(robot).T))
 
 
 GIZMO = "drag the tool"
@@ -468,7 +452,7 @@ class Layers:
         if self._is_on("ignored pairs"):
             scene_overlays.show_ignored_pairs(self._view)
         if has_tool(self._robot):
-            T_root_tool = frame_pose(self._robot, self._page.q)
+            T_root_tool = kinematics.frame_pose(self._robot, self._page.q)
             if self._gizmo is not None and not self._is_dragging:
                 pose = Pose.from_matrix(T_root_tool)
                 self._gizmo.position, self._gizmo.wxyz = pose.position, pose.quaternion
@@ -548,7 +532,7 @@ class Layers:
     def _fit_primitives(self) -> None:
         """Draw the primitives fitted to the links; fits that are not stored are computed."""
         session, folders = self._session, self._session.files.library_folders
-        robot = with_library_meshes(self._robot, session.files.library)
+        robot = robot_uri.with_library_meshes(self._robot, session.files.library)
         primitives, missing = stored_primitives(robot, read_stored_fits(folders))
         if missing:
             text = f"fitting primitives to {len(missing)} links; this takes a while"
@@ -602,7 +586,7 @@ class Layers:
             self._gizmo = None
         if not on:
             return
-        pose = Pose.from_matrix(frame_pose(self._robot, self._page.q))
+        pose = Pose.from_matrix(kinematics.frame_pose(self._robot, self._page.q))
         gizmo = self._gizmo = self._session.client.scene.add_transform_controls(
             "/gizmo",
             scale=0.2 * scene_robot.robot_extent(self._robot),
@@ -621,7 +605,7 @@ class Layers:
                 w, x, y, z = (float(value) for value in gizmo.wxyz)
                 px, py, pz = (float(value) for value in gizmo.position)
                 T_root_gizmo = Pose((px, py, pz), (w, x, y, z)).matrix
-                self._page.move(solve_pose_ik(self._robot, T_root_gizmo, self._page.q))
+                self._page.move(kinematics.solve_pose_ik(self._robot, T_root_gizmo, self._page.q))
 
         gizmo.on_update(dragged)
 
@@ -679,13 +663,13 @@ def _add_downloads(page: RobotPage) -> None:
 
 def _command(page: RobotPage) -> str:
     """Return the command that makes or shows the robot, and its derivation as a comment."""
-    if page.uri.startswith(WORDS):
-        return shlex.join(["morphgen", "compose", *page.uri.removeprefix(WORDS).split()])
+    if page.uri.startswith(robot_uri.WORDS):
+        return shlex.join(["morphgen", "compose", *page.uri.removeprefix(robot_uri.WORDS).split()])
     derivation = page.robot.provenance.get("derivation")
     comment = f"# {derivation}" if derivation else ""
     if ":" not in page.uri:
         return f"morphgen show {shlex.quote(page.uri)}\n{comment}".rstrip()
-    if page.uri.startswith(UPLOAD):
+    if page.uri.startswith(robot_uri.UPLOAD):
         return f"# for the file that you uploaded: morphgen show FILE\n{comment}".rstrip()
     return comment
 

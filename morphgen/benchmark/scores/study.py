@@ -18,18 +18,8 @@ import msgspec
 import numpy as np
 from filelock import FileLock, Timeout
 
+from morphgen.benchmark.scores import submission
 from morphgen.benchmark.scores.results import NOTE, result_rows, result_tables, rows_data
-from morphgen.benchmark.scores.submission import (
-    EPISODES,
-    Submission,
-    Training,
-    append_submission,
-    make_submission,
-    mode_of,
-    name_of,
-    read_table,
-    rules_data,
-)
 from morphgen.errors import MorphgenError, TaskError
 from morphgen.formats.files import LOCK, write_file
 from morphgen.processes import ray_cluster, require_ray
@@ -155,19 +145,19 @@ def matched_budget(config: RunConfig) -> RunConfig:
     return replace(config, ppo=ppo, num_envs=-(-config.num_envs * num_test // num_train))
 
 
-def stored_results(cell: Cell) -> dict[str, Submission]:
+def stored_results(cell: Cell) -> dict[str, submission.Submission]:
     """Return the episodes of a cell in the table of its study, by the names of ``Cell.modes``."""
-    path = cell.study / EPISODES
-    results: dict[str, Submission] = {}
-    for each in read_table(path) if path.is_file() else ():
+    path = cell.study / submission.EPISODES
+    results: dict[str, submission.Submission] = {}
+    for each in submission.read_table(path) if path.is_file() else ():
         run = each.split.name, each.method, each.training_seed
         if run == (cell.split, cell.agent, cell.seed):
-            _require_same(each, cell, f"{path}: {name_of(each)}")
-            results[mode_of(each) or cell.agent] = each
+            _require_same(each, cell, f"{path}: {submission.name_of(each)}")
+            results[submission.mode_of(each) or cell.agent] = each
     return results
 
 
-def _require_same(stored: Submission, cell: Cell, where: str) -> None:
+def _require_same(stored: submission.Submission, cell: Cell, where: str) -> None:
     """Require that stored episodes are of the robots, the evaluation and the run of a cell."""
     split = split_of(cell.source)
     for what, theirs, ours in (
@@ -184,7 +174,7 @@ def _rules(cell: Cell, split: Split) -> dict[str, Any]:
     """Return the rules of a cell's evaluation."""
     config = cell.eval_config
     goals = GoalConfig(seed=cell.source.goal_seed, tasks=config.tasks)
-    return rules_data(config.sim, config.episodes, config.seed, goals, split)
+    return submission.rules_data(config.sim, config.episodes, config.seed, goals, split)
 
 
 def _without_split(config: RunConfig) -> RunConfig:
@@ -244,7 +234,9 @@ def do_cell(
                     scores += evaluate_run(folder, side, eval_config, mode)
                 else:
                     scores += evaluate_baseline(cell.agent, source, eval_config)
-        append_submission(cell.study / EPISODES, _submission(cell, name, scores))
+        submission.append_submission(
+            cell.study / submission.EPISODES, _submission(cell, name, scores)
+        )
 
 
 def finetuning_run(cell: Cell, config: RunConfig, steps: int) -> RunConfig:
@@ -258,14 +250,14 @@ def finetuning_run(cell: Cell, config: RunConfig, steps: int) -> RunConfig:
     return replace(tuned, sim=evaluation_simulator(config.sim), device="cpu")
 
 
-def _submission(cell: Cell, name: str, scores: Sequence[Score]) -> Submission:
+def _submission(cell: Cell, name: str, scores: Sequence[Score]) -> submission.Submission:
     """Return the episodes of one of the modes of a cell."""
     config, (mode, steps), split = cell.config, cell.modes[name], split_of(cell.source)
     training = data = None
     if config is not None:
-        training = Training(config.sim, config.ppo.total_timesteps, steps)
+        training = submission.Training(config.sim, config.ppo.total_timesteps, steps)
         data = msgspec.to_builtins(_without_split(config).as_data())
-    return make_submission(
+    return submission.make_submission(
         split,
         scores,
         method=cell.agent,
@@ -363,11 +355,11 @@ MISSING = "missing"
 
 def write_tables(folder: Path, cells: Sequence[Cell]) -> list[Path]:
     """Write Markdown, JSON and curves of the cells of a study that are done; return their paths."""
-    done: dict[str, Submission] = {}
+    done: dict[str, submission.Submission] = {}
     missing: list[str] = []
     for cell in cells:
         results = stored_results(cell)
-        done |= {name_of(each): each for each in results.values()}
+        done |= {submission.name_of(each): each for each in results.values()}
         seed = "" if cell.seed is None else f" seed {cell.seed}"
         modes = [mode for mode in cell.modes if mode not in results]
         if modes:
