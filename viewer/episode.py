@@ -232,7 +232,6 @@ def _shared_fields(record: Episode | _About) -> dict[str, Any]:
 
 
 def _body(track: Track) -> _Body:
-    """Return the entry of a robot in ``bodies``."""
     return _Body(
         track.robot.name,
         track.uri,
@@ -249,8 +248,6 @@ def _body(track: Track) -> _Body:
 
 
 def _object(thing: ArticulatedObject) -> _Object:
-    """Return the entry of an articulated object."""
-
     def refuse(mesh: Mesh) -> NoReturn:
         raise EpisodeError(f"the object has a mesh, {mesh.path}; files of episodes have none")
 
@@ -259,7 +256,6 @@ def _object(thing: ArticulatedObject) -> _Object:
 
 
 def _arrays(track: Track) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a robot by name."""
     n = track.num_steps
     q = np.array(track.q[: n + 1], dtype=np.float32)
     tool_poses = [Pose.from_matrix(T) for T in frame_pose(track.robot, q)]
@@ -276,7 +272,6 @@ def _arrays(track: Track) -> dict[str, NDArray[Any]]:
 
 
 def _track(body: _Body, arrays: Mapping[str, NDArray[Any]], files: FileAccess) -> Track:
-    """Return a robot's track from its entry in ``bodies`` and its arrays."""
     robot = split_colours(read_robot_uri(body.place, files))
     if robot_hash(robot) != body.body:
         raise EpisodeError(

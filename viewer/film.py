@@ -78,7 +78,6 @@ def make_renderer(track: Track, size: tuple[int, int]) -> Renderer:
 
 
 def _render_frames(episode: Episode) -> Iterator[Frame]:
-    """Yield the frames of a video: the robots of a step, tiled."""
     columns = int(np.ceil(np.sqrt(len(episode.tracks))))
     width, height = (2 * round(edge / columns / 2) for edge in SIZE)  # video codecs want even sizes
     with contextlib.ExitStack() as stack:

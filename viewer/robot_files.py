@@ -98,7 +98,6 @@ def _read_files(folder: Path) -> dict[str, bytes]:
 
 
 def _draw_thumbnail(uri: str, files: FileAccess) -> Thumbnail:
-    """Read, check and render a robot."""
     robot = read_robot_uri(uri, files)
     findings = {finding.code for finding in check(robot) if finding.severity != "info"}
     stats = robot_stats(robot)

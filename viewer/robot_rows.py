@@ -239,7 +239,6 @@ def neighbour_uris(uri: str, files: FileAccess) -> tuple[str, str]:
 
 
 def _set_rows(uri: str, folder: Path) -> Iterator[Row]:
-    """Yield the rows of a robot set from its index."""
     try:
         grammar = str(read_settings(folder)["grammar"])
     except FormatError:

@@ -166,7 +166,6 @@ def collision_text(pairs: Mapping[tuple[str, str], float]) -> str:
 
 
 def _joint_rows(joint: Joint) -> list[tuple[str, str]]:
-    """Return where a joint is, its limits (angles in both units) and what drives it."""
     position, effort, speed = _UNITS.get(joint.kind, _ROTATION_UNITS)
     rows = [
         ("joint", f"{joint.name}, {joint.kind}"),

@@ -104,7 +104,6 @@ class Rollout(EpisodeSource):
 
 
 def _read_controller(policy: str, task: str, files: FileAccess) -> ControllerSpec:
-    """Return the controller that a page names."""
     if not is_named(policy):
         policy = str(checkpoint_path(policy, policies_for(task), files))
     return read_controller(policy, task)
@@ -144,7 +143,6 @@ def training_robots(policy: str, files: FileAccess) -> tuple[str, bool, list[tup
 def _start_robot(
     config: RolloutConfig, uri: str, spec: ControllerSpec, files: FileAccess
 ) -> _SimulatedRobot:
-    """Begin the episode of a robot in an environment of its own."""
     robot = read_robot_uri(uri, files)
     env, controller = make_env_and_controller(
         spec,
@@ -180,7 +178,6 @@ def _track(robot: Robot, uri: str, batch: TaskBatch) -> Track:
 
 
 def _poses(state: RenderState) -> dict[str, Array]:
-    """Return the poses of a state as of a track."""
     return {**state.markers} | ({} if state.block is None else {BLOCK: state.block})
 
 

@@ -136,7 +136,6 @@ def record(
 
 
 def _sources(given: SimpleNamespace) -> tuple[Source, ...]:
-    """Return the robots with their tasks."""
     if (given.robots is None) == (given.drawn is None):
         raise TaskError("expected either robots, as of a split, or grammars to draw robots from")
     for task in given.tasks:
@@ -329,7 +328,6 @@ MAX_EPOCHS = 100_000  # most passes over the steps of demonstrations
 def _cloning_config(
     data: Sequence[Demonstrations], spec: AgentSpec, given: SimpleNamespace
 ) -> RunConfig:
-    """Return the configuration of a run that learns from data sets."""
     source, steps = recorded_source(data), sum(map(len, data))
     words = {"steps": max(round(given.epochs * steps), given.minibatch), "envs": given.minibatch}
     words |= {"sim": data[0].settings["sim"], "geometry": "primitive", "whole": False, "goal": None}

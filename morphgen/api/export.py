@@ -136,7 +136,6 @@ def write_export(
 
 
 def _target(source: RobotReference | None, robot: Robot, given: SimpleNamespace) -> Path:
-    """Return the path of a robot's file or folder."""
     bundle = bundle_of(source) if given.out is None and source is not None else None
     if bundle is not None and given.format in FILES:
         return bundle / f"robot.{given.format}"

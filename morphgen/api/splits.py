@@ -448,7 +448,6 @@ def _word(regime: Regime, rules: Rules) -> str:
 def _choose(
     regime: Regime, rules: Rules, request: SplitRequest, library: Library, jobs: int
 ) -> tuple[Split, ...]:
-    """Return a split for each size of a request."""
     grammars, train, test = (
         [load_sound_grammar(name, library) for name in rules.get(key, ())]
         for key in ("grammar", "train_category", "test_category")

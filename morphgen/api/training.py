@@ -283,7 +283,6 @@ def named_source(given: SimpleNamespace, side: Side = "train") -> SplitSource | 
 
 
 def _task_choices() -> str:
-    """Return the words that name a task, for messages."""
     return " or ".join(f"task={name}" for name in TASKS)
 
 
@@ -483,7 +482,6 @@ def train_run(folder: Path, config: RunConfig, given: SimpleNamespace) -> Traini
 
 
 def _described(folder: Path, config: RunConfig) -> str:
-    """Return in a line what a run trains on what, and where."""
     source, ppo = config.source, config.ppo
     if isinstance(source, RecordedSource):
         return (

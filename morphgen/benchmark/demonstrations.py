@@ -150,7 +150,6 @@ def _card(demos: Demonstrations, parts: Sequence[licences.LicencedPart]) -> str:
 def _croissant(
     demos: Demonstrations, parts: Sequence[licences.LicencedPart], sums: Mapping[str, str]
 ) -> str:
-    """Return the text of ``croissant.json``, with the provenance of the data in terms of PROV-O."""
     data = licences.croissant_head() | licences.croissant_contents(
         "demonstrations_croissant.json", sums
     )
@@ -195,7 +194,6 @@ def _croissant(
 
 
 def _field(column: str, feature: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the field of a feature of LeRobot."""
     field: dict[str, Any] = {
         "@type": "cr:Field",
         "@id": f"steps/{column}",

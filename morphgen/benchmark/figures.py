@@ -41,7 +41,6 @@ _LABEL_DIRECTIONS = np.array(
 
 @contextmanager
 def _default_style() -> Iterator[None]:
-    """Draw with matplotlib's default settings, whatever the user's."""
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         yield
@@ -114,7 +113,6 @@ def _png(figure: Figure) -> bytes:
 
 
 def _name_rows(ax: Axes, names: Sequence[str], *, first: bool) -> None:
-    """Write the names along the bottom, and at the left of the first matrix."""
     if len(names) > MAX_NAMED:
         ax.set_xlabel(f"{len(names)} robots in the order given", fontsize=9)
         return

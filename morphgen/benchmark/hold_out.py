@@ -468,7 +468,6 @@ class _HoldOutSearch:
                 return [self.robots[i] for i in test], [self.robots[i] for i in train]
 
     def _compose(self, unknown: Sequence[int], num_chosen: int, jobs: int) -> None:
-        """Compose robots, or reject them."""
         num_known = num_chosen - len(unknown)
         drafts = [self.pool[number] for number in unknown]
         with part_of(None, num_known):
@@ -543,7 +542,6 @@ class _HoldOutSearch:
         )
 
     def _reasons(self) -> str:
-        """Return why robots were rejected, the most common reasons first."""
         counts = Counter(self.rejected.values()).most_common(2)
         reasons = ", ".join(f"{count} with {reason}" for reason, count in counts)
         links = f"more than {self.request.max_links} links"

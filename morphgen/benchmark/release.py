@@ -484,7 +484,6 @@ def _difficulty_data(survey: surveys.SplitSurvey, audited: Audit) -> dict[str, A
 
 
 def _add_files(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write files into a split folder and list them in its checksums."""
     sums = read_sums(folder / SUMS_FILE)
     for name, content in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -238,7 +238,6 @@ def _read(
 def _compared(
     loader: Loader, robot: Robot, reading: Reading, frame: str, q: Array
 ) -> ConformanceRow:
-    """Compare what a loader read with the robot."""
     expected = frame_pose(robot, q, frame) if frame else np.tile(np.eye(4), (len(q), 1, 1))
     position_offset = reading.T_root_frame[:, :3, 3] - expected[:, :3, 3]
     position_error = float(np.linalg.norm(position_offset, axis=1).max(initial=0.0))
@@ -677,7 +676,6 @@ def _add_missing_inertia(root: etree._Element, urdf: Path) -> None:
 
 @_quirk("refuses a repeated element", refusal="repeated element")
 def _take_first(root: etree._Element, urdf: Path) -> None:
-    """Remove elements that follow one of the same name where there may be one."""
     for parent in (*root.iterfind("joint"), *root.iterfind("link/*")):
         for name in {str(child.tag) for child in parent}:
             for surplus in parent.findall(name)[1:]:
@@ -695,7 +693,6 @@ def _shorten_scales(root: etree._Element, urdf: Path) -> None:
 
 @_quirk("refuses shapes without a size", refusal=r"size \d must be positive")
 def _thicken(root: etree._Element, urdf: Path) -> None:
-    """Give every dimension of zero a millimetre."""
     for shape in root.iterfind("link/*/geometry/*"):
         for name in {"size", "radius", "length"} & set(shape.attrib):
             sizes = [size if float(size) else "0.001" for size in shape.get(name, "").split()]

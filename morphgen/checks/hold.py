@@ -360,7 +360,6 @@ def _mjcf(robot: Robot, folder: Path) -> Iterator[SimulatedRobot]:
 
 
 def _joints(robot: Robot, index: Mapping[str, int]) -> list[int]:
-    """Return a simulator's indices of the movable joints."""
     names = [robot.joints[k].name for k in robot.movable_joints]
     if missing := sorted(set(names) - index.keys()):
         raise FormatError(f"lacks joints {', '.join(missing)}")

@@ -200,7 +200,6 @@ def _pybullet_dynamics(
 
 
 def _no_dynamics(names: Sequence[str], n: int) -> tuple[Array, Array]:
-    """Return arrays for the forces and the inertia of n configurations."""
     samples, joints = min(n, DYNAMICS_SAMPLES), len(names)
     return np.zeros((samples, joints)), np.zeros((samples, joints, joints))
 
@@ -446,7 +445,6 @@ def read_usd(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Readin
 
 
 def _limits(prim: Any) -> tuple[float, float]:  # noqa: ANN401
-    """Return the position limits of a joint [rad or m]."""
     scale = 1.0 if prim.GetTypeName() == "PhysicsPrismaticJoint" else math.pi / 180
     lower, upper = (prim.GetAttribute(f"physics:{end}Limit").Get() for end in ("lower", "upper"))
     return (
@@ -456,7 +454,6 @@ def _limits(prim: Any) -> tuple[float, float]:  # noqa: ANN401
 
 
 def _poses(prim: Any, joints: Mapping[str, Any], q: Mapping[str, Array], n: int) -> Array:  # noqa: ANN401
-    """Return the poses of a prim in the world, shape (n, 4, 4)."""
     if not prim or prim.IsPseudoRoot():
         return np.tile(np.eye(4), (n, 1, 1))
     joint = joints.get(str(prim.GetPath()))
@@ -477,7 +474,6 @@ def _poses(prim: Any, joints: Mapping[str, Any], q: Mapping[str, Array], n: int)
 
 
 def _motion(prim: Any, q: Mapping[str, Array], n: int) -> Array:  # noqa: ANN401
-    """Return the motion of a joint in its frame, shape (n, 4, 4)."""
     axis, positions = prim.GetAttribute("physics:axis").Get(), q.get(prim_name(prim))
     if axis is None or positions is None:  # a fixed joint has no axis
         return np.tile(np.eye(4), (n, 1, 1))
@@ -487,7 +483,6 @@ def _motion(prim: Any, q: Mapping[str, Array], n: int) -> Array:  # noqa: ANN401
 
 
 def _local(position: Any, rotation: Any) -> Array:  # noqa: ANN401
-    """Return the matrix of a joint's local pose on a body."""
     quaternion = np.array([rotation.GetReal(), *rotation.GetImaginary()], np.float64)
     w, x, y, z = (quaternion / np.linalg.norm(quaternion)).tolist()
     px, py, pz = map(float, position)

@@ -227,7 +227,6 @@ def _axis_findings(joint: Joint, where: str) -> Iterator[Finding]:
 
 
 def _limit_findings(robot: Robot, joint: Joint, where: str) -> Iterator[Finding]:
-    """Find limits that are missing, contradictory or implausible."""
     limits, kind = joint.limits, joint.kind
     if kind == "continuous":
         if limits is not None:
@@ -265,7 +264,6 @@ def _drive_findings(robot: Robot, joint: Joint, where: str) -> Iterator[Finding]
 
 
 def _mimic_findings(robot: Robot, joint: Joint, where: str) -> Iterator[Finding]:
-    """Find a mimic joint that cannot move, or whose leader is fixed."""
     mimic = joint.mimic
     if mimic is None:
         return

@@ -114,7 +114,6 @@ class SelfCollisionChecker:
         return free
 
     def _require_rows(self, q: ArrayLike) -> Array:
-        """Return configurations as an array."""
         q = np.asarray(q, dtype=np.float64)
         if q.ndim != 2:
             raise ValueError(f"q has shape {q.shape}; {self._robot.name} needs (n, dof)")

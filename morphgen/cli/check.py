@@ -78,7 +78,6 @@ def _findings(
 
 
 def _totals(results: Mapping[str, tuple[Sequence[Finding], Sequence[Finding]]]) -> list[str]:
-    """Return a line with the numbers of robots that have findings, if there are several robots."""
     if len(results) < 2:
         return []
     counts = Counter[str](
@@ -148,7 +147,6 @@ _MAX_NOTE = 400  # number of characters of a row's message; `--json` has all
 
 
 def _conformance_text(reports: Mapping[str, ConformanceReport]) -> str:
-    """Return the tables of loaders and simulators, each followed by what went wrong."""
     sections = []
     for rows_of, columns in (("rows", _LOADER_COLUMNS), ("holds", _SIMULATOR_COLUMNS)):
         rows, notes = [], []

@@ -392,7 +392,6 @@ def add_commands(parser: Parser, commands: Sequence[Command], path: str = "") ->
 
 
 def _add_options(parser: Parser, command: Command) -> None:
-    """Add the options of a command to its parser."""
     if command.basic:
         text = "show the most used options and exit"
         parser.add_argument("-h", "--help", action=_BriefHelp, help=text)

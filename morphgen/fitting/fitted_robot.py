@@ -104,7 +104,6 @@ def _model(shapes: tuple[Shape, ...]) -> fcl.CollisionObject:
 
 
 def _share(hits: int, misses: int) -> float:
-    """Return the share of hits; 1 if there are neither hits nor misses."""
     return hits / (hits + misses) if hits + misses else 1.0
 
 

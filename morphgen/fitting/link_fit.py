@@ -114,7 +114,6 @@ def _round_up(length: float) -> float:
 
 
 def _best_rotation(kind: Kind, hull: trimesh.Trimesh) -> Array:
-    """Return the rotation of least volume, shape (3, 3); near ties go to the link's axes."""
     points = np.asarray(hull.vertices)
     few = _outermost(points)
     measure, rough = (
@@ -160,12 +159,10 @@ def _refined(measure: Callable[[Array], float], points: Array, R: Array, dof: in
 
 
 def _box_volume(points: Array) -> float:
-    """Return the volume of the box around points, along their axes."""
     return float(np.ptp(points, axis=0).prod())
 
 
 def _cylinder_volume(points: Array) -> float:
-    """Return the volume of the cylinder around points, along their z axis."""
     return float(math.pi * smallest_ball(points[:, :2])[1] ** 2 * np.ptp(points[:, 2]))
 
 

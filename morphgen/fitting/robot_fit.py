@@ -314,7 +314,6 @@ def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manife
 
 
 def _mesh_keys(manifest: Manifest) -> set[str]:
-    """Return the keys of the shapes of links with meshes."""
     links = (fit_files.shapes_to_fit(link) for link in load_part(manifest).fragment.links)
     return {fit_files.shapes_key(shapes) for shapes in links if fit_files.has_meshes(shapes)}
 

@@ -252,7 +252,6 @@ def mesh_file(mesh: Mesh) -> tuple[str, bytes]:
 
 
 def _exported(mesh: Mesh) -> tuple[bytes, str]:
-    """Return the triangles of a mesh as a file, and its suffix."""
     from trimesh.exchange.obj import export_obj
     from trimesh.exchange.stl import export_stl
 

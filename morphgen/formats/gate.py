@@ -109,7 +109,6 @@ def _keep_known(element: etree._Element) -> None:
 
 
 def _mesh_copies(folder: Path) -> Callable[[Path], str]:
-    """Return a function that writes a mesh into a folder and returns its name there."""
     names: dict[Path, str] = {}
 
     def copied(path: Path) -> str:

@@ -363,7 +363,6 @@ def _path_list(variable: str) -> list[Path]:
 
 
 def _declared_name(folder: Path) -> str | None:
-    """Return the name in a folder's ``package.xml``, if it has one."""
     manifest = folder / "package.xml"
     if not manifest.is_file():
         return None
@@ -383,13 +382,11 @@ def _read_name(manifest: Path, mtime_ns: int) -> str | None:
 
 @lru_cache(maxsize=1)
 def _morphgen_folders() -> tuple[Path, ...]:
-    """Return the folders of morphgen's own parts."""
     return tuple(Path(str(files(package))).resolve() for package in _MORPHGEN_PACKAGES)
 
 
 @lru_cache(maxsize=1)
 def _data_roots() -> tuple[Path, ...]:
-    """Return the folders of ROS packages in the installed pip data packages."""
     roots = []
     for name, folders in _DATA_ROOTS.items():
         try:

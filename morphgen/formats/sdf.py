@@ -172,7 +172,6 @@ def _write_ends(element: etree._Element, parent: str, child: str) -> None:
 
 
 def _write_values(parent: etree._Element, tag: str, **values: str) -> None:
-    """Add an element whose children hold the values."""
     element = etree.SubElement(parent, tag)
     for name, value in values.items():
         etree.SubElement(element, name).text = value

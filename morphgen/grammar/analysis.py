@@ -283,7 +283,6 @@ def _faults_of(item: Item, grammar: Grammar, library: Library, scope: Scope) -> 
 
 
 def _never_ending(grammar: Grammar) -> Iterator[str]:
-    """Find symbols without a finite derivation."""
     symbols = {production.symbol for production in grammar.productions}
     contents = [
         (production.symbol, symbols & {item.name for item in alternative.items})

@@ -235,7 +235,6 @@ def survey_contacts(robot: Robot, derivation: Derivation, library: Library) -> C
 
 @lru_cache(maxsize=256)
 def _ignored_in_part(part: Part) -> tuple[Pair, ...]:
-    """Return the pairs of a part's own links whose contacts are ignored."""
     fragment = part.fragment
     collisions = (shape.geometry for link in fragment.links for shape in link.collisions)
     key = (fragment, *(mesh_key(each) for each in collisions if isinstance(each, Mesh)))

@@ -88,7 +88,6 @@ class Library:
                 yield result
 
     def _results(self) -> Iterator[Manifest | PartError]:
-        """Yield the manifest of every part, or why it cannot be read, by name."""
         for path in self.paths.values():
             try:
                 yield _manifest(path)

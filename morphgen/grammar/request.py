@@ -72,7 +72,6 @@ def _pin_parameter(grammar: Grammar, part: str, name: str, value: str, library: 
 
 
 def _parts(grammar: Grammar) -> set[str]:
-    """Return the names of the parts that a grammar uses."""
     names = {item.name for production in grammar.productions for item in production.items()}
     return {name for name in names if grammar.production(name) is None}
 

@@ -216,7 +216,6 @@ class _IndexLine(msgspec.Struct):
 
 
 def _record(sample: Sample) -> Record:
-    """Return a robot's line of the index."""
     robot = sample.robot
     return {
         "index": sample.index,

@@ -182,7 +182,6 @@ def robots_in(folder: Path) -> Iterator[Path]:
 
 
 def _file_sources(path: Path) -> list[RobotReference]:
-    """Return the robots of a file or folder."""
     if not path.exists():
         raise FormatError(f"{path}: no such file or folder")
     robots = [path] if path.is_file() else list(robots_in(path))
@@ -192,7 +191,6 @@ def _file_sources(path: Path) -> list[RobotReference]:
 
 
 def _no_robot(path: Path) -> FormatError:
-    """Return the error for a path that exists and is no robot."""
     files = sorted(path.iterdir()) if path.is_dir() else ()
     inside = next((file for file in files if file.name.endswith(SUFFIXES)), None)
     return FormatError(

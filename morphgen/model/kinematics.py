@@ -356,7 +356,6 @@ class FramePosition:
 
 
 def _rows(T: Pose) -> tuple[float, ...]:
-    """Return the first three rows of a homogeneous matrix, 12 numbers."""
     return tuple(T.matrix[:3].ravel().tolist())
 
 

@@ -348,7 +348,6 @@ def _joint_tensors(
     *,
     pad_front: bool,
 ) -> JointTensors:
-    """Stack and pad the joints of all robots."""
     size = len(robots), length
     T = np.tile(np.eye(4), (*size, 1, 1))
     axis, prismatic = np.tile((0.0, 0.0, 1.0), (*size, 1)), np.zeros(size, dtype=np.bool_)

@@ -190,7 +190,6 @@ def _make_scaled(mesh: Mesh) -> Triangles:
 
 
 def _content(path: Path) -> MeshContent:
-    """Return what a file holds, its triangles by colour."""
     content = _content_or_fault(str(path.absolute()), _stamp(path))
     if isinstance(content, str):
         raise MeshError(content)

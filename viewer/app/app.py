@@ -100,8 +100,6 @@ def serve(
 
 
 def _accept_browsers(viewer: Viewer) -> None:
-    """Give every browser that connects a session."""
-
     async def connect(client: viser.ClientHandle) -> None:
         token = secrets.token_urlsafe(24)
         session = Session(
@@ -240,7 +238,6 @@ def start_address(words: Sequence[str], files: robot_uri.FileAccess) -> Address:
 
 
 def _path_address(text: str, files: robot_uri.FileAccess) -> Address:
-    """Return the page of a file or folder."""
     path = files.path(text)
     if path.suffix == robot_uri.EPISODE_SUFFIX:
         from morphgen.viewer.episode import read_episode

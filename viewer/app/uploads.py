@@ -108,7 +108,6 @@ def store_upload(name: str, content: bytes, files: FileAccess) -> str:
 
 
 def _unzip(name: str, content: bytes) -> dict[str, bytes]:
-    """Return the files of a zip by their paths, after checking its table of contents."""
     try:
         require_few_entries(io.BytesIO(content), LIMITS)
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -147,7 +146,6 @@ def _format(document: etree._Element | FormatError) -> str | None:
 
 
 def _root(documents: _Documents, path: str) -> etree._Element:
-    """Return the root of a description."""
     document = documents[path]
     if isinstance(document, FormatError):
         raise UploadError(f"{document}; nothing was kept") from document

@@ -121,7 +121,6 @@ def _without(uris: tuple[str, ...], i: int) -> tuple[str, ...]:
 
 
 def _add_picker(session: Session, uris: tuple[str, ...]) -> None:
-    """Add controls that add a robot to the compared ones."""
     lists = controls.robot_lists(uris[0] if uris else "", session.files, {})
     with session.client.gui.add_folder("Add a robot"):
         picker = controls.add_picker(session, lists, lambda: uris[0] if uris else "")

@@ -195,7 +195,6 @@ class ComposingTab(ABC):
         key: str,
         change: Callable[[float], None],
     ) -> None:
-        """Add the slider of a part's parameter."""
         low, high = parameter.minimum, parameter.maximum
         slider = self._session.client.gui.add_slider(
             name.replace("_", " ") + (f" ({parameter.unit})" if parameter.unit else ""),
@@ -370,7 +369,6 @@ class GrammarTab(ComposingTab):
             )
 
     def _load(self, source: str) -> None:
-        """Replace the text by that of another grammar."""
         self._source = source
         self._name = Path(source).stem if source.endswith(SUFFIX) else source
         self._original = grammar_text(resolve_grammar(source, self._session.files))
@@ -437,16 +435,13 @@ class GrammarTab(ComposingTab):
         self._session.run_script(call("mark", line, column))
 
     def _send(self) -> None:
-        """Let the browser save the text as a file."""
         self._session.send_file(f"{self._name}{SUFFIX}", self._text.value.encode())
 
     def _start_from(self, source: str) -> None:
-        """Show the typical robot of another grammar."""
         self._load(source)
         self._draw("typical")
 
     def _draw(self, action: str) -> None:
-        """Show the ``typical`` robot, ``this`` sampled one, or the ``next``."""
         if action == "next":
             set_value(self._number, self._number.value + 1)
         self._is_drawn = action != "typical"
@@ -463,7 +458,6 @@ class GrammarTab(ComposingTab):
         self._show_robot(Shown(robot, partial, f"# {partial}", uri, self._source))
 
     def _show_tree(self, derivation: Derivation, n: int) -> None:
-        """Show the derivation as a tree; parts beyond the first ``n`` are grey."""
         lines = [escape(line) for line in outline(derivation).splitlines()]
         lines[n:] = [f'<span class="dim">{line}</span>' for line in lines[n:]]
         self._tree.content = markup.framed(f"<h3>Derivation</h3><pre>{'<br>'.join(lines)}</pre>")
@@ -607,7 +601,6 @@ class ComposePage:
         session.notify("Written", target)
 
     def _send_bundle(self, name: str) -> None:
-        """Send a zip of the robot's bundle to the browser."""
         session, robot = self._session, self._named_robot(name)
         folder = bundle_folder(Path(), robot.name).name  # validates the name
         with session.activity("packing the bundle"):
@@ -664,7 +657,6 @@ class ComposeView:
         return change_text(self._ghost.robot, robot) if self._ghost else ""
 
     def _is_in_picture(self, low: Array, high: Array) -> bool:
-        """Return whether the camera sees all corners of a box."""
         picture = camera_view(self._session.client)
         points, depths = project_points(picture, box_corners(low, high))
         shares = points / (picture.aspect, 1.0)

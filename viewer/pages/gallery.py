@@ -504,7 +504,6 @@ def show_chosen(session: Session) -> None:
 
 
 def _set_sides(rows: list[robot_rows.Row], num_train: int) -> None:
-    """Give rows their sides: the first ones are to train on."""
     rows[:] = [replace(row, role=SIDES[int(i >= num_train)]) for i, row in enumerate(rows)]
 
 

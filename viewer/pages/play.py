@@ -278,7 +278,6 @@ class PlayPage:
         self._scene = self._source = None
 
     def _write_time(self) -> str:
-        """Return the time at which the episode is paused, for the address."""
         if self._position is None or self._source is None:
             return ""
         return f"{self._position * self._source.episode.period:.4g}"
@@ -291,7 +290,6 @@ class PlayPage:
             self.player.go_to(round(self._time.value / self._source.episode.period))
 
     def _update_plots(self) -> None:
-        """Update the charts to what is simulated and shown."""
         if self._source is not None:
             for chart, data in zip(
                 self._charts, curves(self._source.episode, self._step), strict=False

@@ -161,7 +161,6 @@ def move_roles(population: Population, q: Array, shares: dict[str, float]) -> Ar
 
 
 def _copies(shape: Shape) -> list[tuple[Prototype, Pose, Array]]:
-    """Return the prototypes that draw a shape, with their poses on the link and their scales."""
     pose = shape.T_link_shape
     match shape.geometry:
         case Box(size):
@@ -525,7 +524,6 @@ class PopulationPage:
         self.select(~self.selected if action == "invert" else everything)
 
     def _choose(self) -> None:
-        """Put the selected robots into the tray."""
         if not self._selected_rows:
             raise robot_uri.UriError(
                 "no robot is selected: drag a rectangle with the shift key held"
@@ -534,7 +532,6 @@ class PopulationPage:
         self.session.choose((*self.session.chosen, *uris))
 
     def _add_sliders(self) -> None:
-        """Add a slider for each role of joints."""
         gui, roles, role = self.session.client.gui, self.population.roles, self.population.role
         for title, initial in (
             ("Joints from the base to the tool", "j"),
@@ -577,7 +574,6 @@ class PopulationPage:
         self.session.show_state()
 
     def _connect_pointer(self) -> None:
-        """Let clicks and rectangles select robots."""
         session, robots = self.session, np.arange(len(self.population))
 
         def click(part: slice, event: viser.SceneNodePointerEvent[viser.BatchedMeshHandle]) -> None:

@@ -88,7 +88,6 @@ def _location(session: Session, uri: str) -> str:
 
 
 def _links(robot: Robot, uri: str) -> str:
-    """Return links to what can be done with a robot, as HTML."""
     links = [markup.choose_box(uri, "choose")]
     if robot.provenance.get("derivation"):
         target = Address("compose", (uri.removeprefix(robot_uri.WORDS),))
@@ -191,7 +190,6 @@ class RobotPage:
         self.session.show_state_later()
 
     def _scale(self, row: int) -> float:
-        """Return the slider's unit per unit of q."""
         joint = self.robot.joints[self.robot.independent_joints[row]]
         return 1.0 if joint.kind == "prismatic" else ANGLES[self._angles.value]
 
@@ -233,7 +231,6 @@ class RobotPage:
         self.update_scene()
 
     def _go_to(self, target: str) -> None:
-        """Move the robot to a configuration: ``home``, ``zero`` or ``random``."""
         robot = self.robot
         if target == "random":
             (q,) = kinematics.random_configurations(robot, 1, np.random.default_rng())
@@ -250,7 +247,6 @@ class RobotPage:
         self.session.show_state()
 
     def _show_card(self) -> None:
-        """Show the card of the selected link."""
         card = ""
         if name := self.selected:
             text = robot_tables.link_card(self.robot, name, self.findings)
@@ -293,7 +289,6 @@ class RobotPage:
                 frame.on_drag(_LinkDrag(self, link, row).moved)
 
     async def _clicked(self, name: str, event: viser.SceneNodePointerEvent[Any]) -> None:
-        """Select the link that was clicked, or none if it already was."""
         del event
         self.session.enqueue(lambda: self.select("" if name == self.selected else name))
 
@@ -458,7 +453,6 @@ class Layers:
                 self._gizmo.position, self._gizmo.wxyz = pose.position, pose.quaternion
 
     def _write(self) -> str:
-        """Return the checked boxes for the address."""
         shown = ",".join(name for name, box in self._boxes.items() if box.value)
         return "" if shown == "visual" else shown or "none"
 
@@ -467,7 +461,6 @@ class Layers:
             set_value(box, name in text.split(","))
 
     def _is_on(self, name: str) -> bool:
-        """Return whether a box exists and is checked."""
         return name in self._boxes and self._boxes[name].value
 
     def _toggle(self, name: str) -> None:
@@ -573,7 +566,6 @@ class Layers:
         scene_stage.look_at(self._session.client, low, high)
 
     def _move_slice(self) -> None:
-        """Draw the workspace, cut at the slider's position."""
         if self._workspace is not None and self._is_on("workspace"):
             with self._session.client.atomic():
                 scene_overlays.show_workspace(self._view, *self._workspace, self._slice.value)

@@ -124,7 +124,6 @@ def _description(split: Split) -> str:
 
 
 def _rollout_link(name: str, split: Split) -> str:
-    """Return a link to a rollout of the first test robots."""
     first = split.test[0]
     robots = tuple(
         member_uri(name, "test", member)
@@ -165,7 +164,6 @@ def _study(page: SplitPage) -> None:
 
 
 def _draw_map(page: SplitPage) -> None:
-    """Draw the map and the heatmap of the chosen measure."""
     study = page.study
     if study is None or not study.members:
         return
@@ -191,7 +189,6 @@ def _draw_map(page: SplitPage) -> None:
 
 
 def _shown_sides(gallery: Gallery) -> Sides:
-    """Return the members that pass the filter by their sides."""
     sides: dict[str, list[Member]] = {side: [] for side in SIDES}
     for row in passing_rows(gallery):
         sides[row.role].append(resolve_member(row.uri, gallery.session.files))

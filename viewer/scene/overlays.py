@@ -93,7 +93,6 @@ def _centre(link: Link) -> Vec3:
 
 
 def _add_label(view: RobotView, i: int, name: str, text: str) -> Any:  # noqa: ANN401
-    """Write a text at the centre of link i, and return its node."""
     return view.scene.add_label(
         f"{view.name}/{i}/{name}",
         text,

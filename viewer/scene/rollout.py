@@ -113,7 +113,6 @@ def grid_positions(areas: Sequence[tuple[Array, Array]]) -> list[Position]:
 def _add_track(
     scene: viser.SceneApi, name: str, track: Track, position: Position, *, labelled: bool
 ) -> DrawnTrack:
-    """Draw a robot of an episode with its obstacles, markers and block."""
     scene.add_frame(name, show_axes=False, position=position)
     view = add_robot(scene, track.robot, f"{name}/robot")
     for i, obstacle in enumerate(track.obstacles):
@@ -161,7 +160,6 @@ def episode_page(episode: Episode, dark: bool) -> bytes:
 
 
 def _record(server: viser.ViserServer, episode: Episode) -> StateSerializer:
-    """Draw an episode in a server's scene and return its recording."""
     scene = add_episode(server.scene, episode)
     place_camera(server.initial_camera, scene.low, scene.high)
     recording = server.get_scene_serializer()

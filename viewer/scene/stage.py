@@ -252,7 +252,6 @@ class _Placement:
 
 
 def _used_aspect(camera: viser.CameraHandle) -> float:
-    """Return the aspect for which the camera is placed."""
     return min(camera.aspect, _MAX_ASPECT) if camera.aspect > _STRIP_ASPECT else _PAGE_ASPECT
 
 

@@ -171,7 +171,6 @@ def _require_same(stored: submission.Submission, cell: Cell, where: str) -> None
 
 
 def _rules(cell: Cell, split: Split) -> dict[str, Any]:
-    """Return the rules of a cell's evaluation."""
     config = cell.eval_config
     goals = GoalConfig(seed=cell.source.goal_seed, tasks=config.tasks)
     return submission.rules_data(config.sim, config.episodes, config.seed, goals, split)
@@ -251,7 +250,6 @@ def finetuning_run(cell: Cell, config: RunConfig, steps: int) -> RunConfig:
 
 
 def _submission(cell: Cell, name: str, scores: Sequence[Score]) -> submission.Submission:
-    """Return the episodes of one of the modes of a cell."""
     config, (mode, steps), split = cell.config, cell.modes[name], split_of(cell.source)
     training = data = None
     if config is not None:

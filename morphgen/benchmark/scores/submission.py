@@ -407,7 +407,6 @@ MAX_BYTES = 128 * 2**20
 
 
 def _table_text(submission: Submission) -> str:
-    """Return the lines of a submission, without the names of the columns."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     head = msgspec.to_builtins(submission)
@@ -478,7 +477,6 @@ def _submissions(lines: Sequence[str], path: Path) -> Iterator[Submission]:
 
 
 def _robot(named: Mapping[str, str], rows: Iterable[Mapping[str, str]]) -> dict[str, Any]:
-    """Return the data of a robot's outcomes."""
     values: dict[str, list[Any]] = {name: [] for name in (*LISTS, *RANDOM)}
     for row in rows:  # one at a time: as a mapping, a row takes ten times its text
         for name, own in values.items():

@@ -220,7 +220,6 @@ def _left_out_findings(root: etree._Element, path: Path) -> Iterator[Finding]:
 
 
 def _require_plain(root: etree._Element, path: Path) -> None:
-    """Require names without a namespace."""
     for element in root.iter():
         for name in map(etree.QName, (str(element.tag), *map(str, element.attrib))):
             if name.namespace is not None:
@@ -294,7 +293,6 @@ def _joined(folder: str, name: str) -> str:
 
 
 def _drop(element: etree._Element, *keys: str) -> None:
-    """Remove attributes, if the element has them."""
     for key in keys:
         if key in element.attrib:
             del element.attrib[key]

@@ -179,7 +179,6 @@ def with_frames(robot: Robot, names: Sequence[str]) -> Robot:
 
 
 def _written_home(root: etree._Element, origin: str) -> dict[str, float]:
-    """Return the home positions by joint that ``urdf_text`` wrote."""
     home = {}
     for element in root.iterfind(f"{MORPHGEN_TAG}/home"):
         text = element.get("position", "")

@@ -347,7 +347,6 @@ class _Evaluation:
         raise _refused(node, self._text)
 
     def _spend(self, work: int) -> None:
-        """Subtract work from the remaining work."""
         self._work -= work
         if self._work < 0:
             raise RefusedError(f"it takes more than {MAX_WORK} steps")
@@ -438,7 +437,6 @@ def _entry(names: Mapping[str, object], name: str) -> object:
 
 
 def _variables(target: ast.expr, item: Value) -> dict[str, object]:
-    """Return the variables of a comprehension for an item."""
     if isinstance(target, ast.Name):
         return {target.id: item}
     names = [name.id for name in _targets(target) if isinstance(name, ast.Name)]
@@ -449,7 +447,6 @@ def _variables(target: ast.expr, item: Value) -> dict[str, object]:
 
 
 def _targets(target: ast.expr) -> list[ast.expr]:
-    """Return the nodes of a comprehension's variables."""
     return target.elts if isinstance(target, ast.Tuple) else [target]
 
 
@@ -523,7 +520,6 @@ def _require_allowed(node: ast.AST, text: str) -> None:
 
 
 def _refused(node: ast.AST, text: str) -> RefusedError:
-    """Return the error for a construct that is not allowed."""
     source = ast.get_source_segment(text, node) or text
     return RefusedError(f"{type(node).__name__} {source[:80]!r} is not allowed")
 
