@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from morphgen.checks.self_collision import SelfCollisionChecker, untested_pairs
 from morphgen.errors import MeshError
-from morphgen.formats.data_files import parse_yaml
-from morphgen.model.findings import Finding
+from morphgen.model.findings import Finding, texts_of
 from morphgen.model.geometry import Capsule, Geometry, Mesh, Shape, dimensions
 from morphgen.model.inertia import (
     bounding_box,
@@ -50,26 +49,8 @@ if TYPE_CHECKING:
 DEFAULT_DENSITY = 1000.0  # density of a link whose source gives no mass [kg/m^3]; that of water
 
 
-@cache
-def _rows() -> Mapping[str, Mapping[str, str]]:
-    path = Path(__file__).with_name("findings.yaml")
-    rows: Mapping[str, Mapping[str, str]] = parse_yaml(path.read_text("utf-8"), str(path))
-    return rows
-
-
-def found(row: str, where: str, **values: Any) -> Finding:  # noqa: ANN401
-    """Return the finding of a row of ``findings.yaml``, with the values of its texts.
-
-    values: ``repairable=False`` says that the repair of the row is not possible here.
-    """
-    entry, repairable = _rows()[row], values.pop("repairable", True)
-    why, fix, repair = (
-        entry.get(key, "").format(density=DEFAULT_DENSITY, **values)
-        for key in ("why", "fix", "repair")
-    )
-    severity: Any = entry["severity"]
-    return Finding(row.split("/")[0], severity, where, why, fix, repair if repairable else "")
-
+found = texts_of(Path(__file__).with_name("findings.yaml"), density=DEFAULT_DENSITY)
+"""Return the finding of a row of ``findings.yaml``."""
 
 GYRATION_FACTOR = 5.0
 """Largest plausible ratio between radii of gyration and those of the solid geometry."""

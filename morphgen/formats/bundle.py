@@ -30,6 +30,7 @@ from morphgen.formats.resolve import default_finder
 from morphgen.formats.rounding import round_number
 from morphgen.formats.urdf.read import read_urdf, with_frames
 from morphgen.formats.urdf.write import urdf_text
+from morphgen.formats.xml import found
 from morphgen.model.dynamics import actuation
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh, Shape, StoredFits
@@ -164,13 +165,9 @@ def file_findings(folder: Path) -> tuple[Finding, ...]:
         if not is_inside:
             raise FormatError(f"{folder / CARD}: hashes: {name!r} leads out of the folder")
         if not exists:
-            code, why = "file-missing", "the card names it, but it does not exist"
+            findings.append(found("file-missing", f"file {name}"))
         elif file_sha256(path) != expected:
-            code, why = "file-changed", "its content differs from the card's hash"
-        else:
-            continue
-        fix = "compose or import the robot again, or read the URDF alone"
-        findings.append(Finding(code, "warning", f"file {name}", why, fix))
+            findings.append(found("file-changed", f"file {name}"))
     return tuple(findings)
 
 

@@ -19,8 +19,10 @@ from msgspec import field
 from morphgen.errors import FormatError
 from morphgen.formats.data_files import parse_yaml
 from morphgen.formats.records import Record, read_record
-from morphgen.model.findings import Finding
+from morphgen.model.findings import Finding, texts_of
 
+found = texts_of(Path(__file__).with_name("findings.yaml"))
+"""Return the finding of a row of ``findings.yaml``."""
 _LOCATION = re.compile(r",? line \d+, column \d+.*$", re.DOTALL)
 _ENCODING = re.compile(rb"""<\?xml[^>]{0,200}?encoding\s*=\s*["']([\w.:-]{1,40})["']""")
 # Those without an end match up to that of the text, or the search would take quadratic time.
@@ -198,8 +200,7 @@ def _recovered(text: str, origin: str) -> tuple[etree._Element | None, list[Find
 
 def _finding(where: str, count: int, what: str, repair: str, code: str = "xml-repaired") -> Finding:
     times = f" ({count} times)" if count > 1 else ""
-    why = f"it is not valid XML: {what}{times}"
-    return Finding(code, "warning", f"{where} document", why, "correct it", f"{what}: {repair}")
+    return found(code, f"{where} document", what=what, times=times, how=repair)
 
 
 def _doctype_error(origin: str) -> FormatError:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Literal
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
 
 Severity = Literal["error", "warning", "info"]
 
@@ -37,7 +40,28 @@ class Finding:
         return {**data, "fixable": self.fixable}
 
 
-def left_out(code: str, where: str, what: str) -> Finding:
-    """Return a finding about content that a robot cannot hold, and that nobody has to change."""
-    why, repair = f"a robot has no place for {what}", f"left out: {what}"
-    return Finding(code, "info", where, why, "none is needed", repair)
+def texts_of(path: Path, **constants: object) -> Callable[..., Finding]:
+    """Return a function that makes the findings of a YAML file, which has all of their texts.
+
+    Its arguments are the name of a row, which begins with the code, the place, and the values in
+    the texts; ``repairable=False`` says that the repair of the row is not possible here. A row
+    without a severity is a warning if it is repaired, else an error.
+    """
+
+    @cache
+    def rows() -> Any:  # noqa: ANN401
+        import yaml  # here, because most robots have no findings
+
+        loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+        return yaml.load(path.read_text("utf-8"), Loader=loader)
+
+    def found(row: str, where: str, *, repairable: object = True, **values: object) -> Finding:
+        entry = rows()[row]
+        why, fix, repair = (
+            entry.get(key, "").format(**constants, **values) for key in ("why", "fix", "repair")
+        )
+        repair = repair if repairable else ""
+        severity = entry.get("severity", "warning" if repair else "error")
+        return Finding(row.split("/")[0], severity, where, why, fix, repair)
+
+    return found

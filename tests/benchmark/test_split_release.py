@@ -12,10 +12,9 @@ import yaml
 from helpers.commands import tree
 from helpers.splits import TEST, TRAIN, combined, member
 from morphgen.benchmark import release as release_module
+from morphgen.benchmark.licences import CROISSANT_FILE, LICENCES_FILE
 from morphgen.benchmark.release import (
-    CROISSANT_FILE,
     DIFFICULTY_FILE,
-    LICENCES_FILE,
     RELEASE_FILE,
     ReleaseRequest,
     opened_folder,

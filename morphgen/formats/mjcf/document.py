@@ -16,8 +16,8 @@ from morphgen.formats.resolve import PackageFinder, require_allowed_text, resolv
 from morphgen.formats.urdf.read import UnsoundError
 from morphgen.formats.urdf.schema import MAX_LINKS, counted_elements
 from morphgen.formats.xacro.evaluator import RefusedError
-from morphgen.formats.xml import parse_description, read_schema
-from morphgen.model.findings import Finding, left_out
+from morphgen.formats.xml import found, parse_description, read_schema
+from morphgen.model.findings import Finding
 from morphgen.model.mesh import require_bounded_files
 
 MAX_MJCF_BYTES = 8 * 2**20  # largest MJCF that is read, with all its includes [bytes]
@@ -203,20 +203,20 @@ def _left_out_findings(root: etree._Element, path: Path) -> Iterator[Finding]:
         element = todo.pop()
         tag, names = str(element.tag), [str(name) for name in element.attrib]
         unheld = (*_SCHEMA.elements.get(tag, "").split(), *_ALLOCATING)
-        if found := [(element, name) for name in names if name in unheld]:
-            attributes.setdefault(tag, []).extend(found)
+        if places := [(element, name) for name in names if name in unheld]:
+            attributes.setdefault(tag, []).extend(places)
         for child in element:
             if child.tag in skipped:
                 elements.setdefault((tag, str(child.tag)), []).append(child)
         todo += reversed([child for child in element if child.tag not in skipped])
     for (tag, name), children in elements.items():
         what = counted_elements(children, name, tag)
-        yield left_out("element-unread", f"{path}:{children[0].sourceline}", what)
+        yield found("element-unread/known", f"{path}:{children[0].sourceline}", what=what)
     for tag, places in attributes.items():
         counts = Counter(name for _, name in places)
         what = ", ".join(f"{n} {name}=..." for name, n in sorted(counts.items()))
         where = f"{path}:{places[0][0].sourceline}"
-        yield left_out("attribute-unread", where, f"{what} of <{tag}>")
+        yield found("attribute-unread/known", where, what=f"{what} of <{tag}>")
 
 
 def _require_plain(root: etree._Element, path: Path) -> None:
@@ -278,9 +278,7 @@ def _take_mesh_files(root: etree._Element, path: Path, finder: PackageFinder) ->
             meshes[name] = resolve_uri(_joined(folder, inside), path, finder)
         except FormatError as error:
             where = f"{path}: mesh {name!r}"
-            missing.append(
-                Finding("mesh-unresolved", "error", where, str(error), "correct the mesh path")
-            )
+            missing.append(found("mesh-unresolved", where, error=error, hint=""))
     if missing:
         raise UnsoundError(str(path), missing)
     require_bounded_files(meshes.values(), str(path))

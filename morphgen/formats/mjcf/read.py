@@ -28,6 +28,7 @@ from morphgen.formats.resolve import PackageFinder, default_finder
 from morphgen.formats.urdf.read import require_description_file
 from morphgen.formats.urdf.schema import MAX_LINKS, MAX_NUMBER, MAX_SHAPES, MAX_TEXT
 from morphgen.formats.urdf.write import BOUND_MASS
+from morphgen.formats.xml import found
 from morphgen.model import rotation
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import (
@@ -128,9 +129,9 @@ def compile_document(
                 f"{array} of the compiled model has the value {worst:g}; expected numbers up to "
                 f"{MAX_NUMBER:g}"
             )
-    where, fix = f"{document.path.name}: document", "change the MJCF as MuJoCo says"
-    texts = (f"MuJoCo warns: {' '.join(text.split())}" for text in dict.fromkeys(warnings))
-    findings = tuple(Finding("mujoco-warning", "warning", where, text, fix) for text in texts)
+    where = f"{document.path.name}: document"
+    texts = (" ".join(text.split()) for text in dict.fromkeys(warnings))
+    findings = tuple(found("mujoco-warning", where, text=text) for text in texts)
     return spec, model, findings
 
 
@@ -315,10 +316,7 @@ def _robot_root(
     if _is_free(model, body):
         if shapes:
             where = f"{document.path.name}: worldbody"
-            why = f"{len(shapes)} geoms of the world stand beside a robot with a free base"
-            fix = "put them into a body of the robot, if they belong to it"
-            repair = f"{len(shapes)} geoms of the world were left out"
-            findings.append(Finding("world-shapes", "warning", where, why, fix, repair))
+            findings.append(found("world-shapes", where, count=len(shapes)))
         return body
     is_welded = (
         model.body_jntnum[body] == 0
@@ -431,9 +429,7 @@ class _Reader:
         home = self._home(joints)
         if self._ellipsoids:
             where = f"{self._document.path.name}: geom {listed(self._ellipsoids)}"
-            why, fix = "a robot has no ellipsoids", "use a capsule, if the shape has to be exact"
-            repair = "became a convex mesh of the volume of the ellipsoid"
-            self._findings.append(Finding("ellipsoid-mesh", "info", where, why, fix, repair))
+            self._findings.append(found("ellipsoid-mesh", where))
         return Robot(
             self._document.name,
             tuple(links),
@@ -647,11 +643,7 @@ class _Reader:
         home = tuple(q if _is_within(j, q) else sum(j.effective_limits) / 2 for j, q in refs)
         if outside:
             where = f"{self._document.path.name}: key {keys[key]!r}"
-            why = f"the position of joint {outside[0]!r} is outside its limits"
-            repair = "the keyframe was left out; home is the reference position"
-            fix = "correct qpos of the keyframe"
-            code = "keyframe-outside-limits"
-            self._findings.append(Finding(code, "warning", where, why, fix, repair))
+            self._findings.append(found("keyframe-outside-limits", where, joint=outside[0]))
         return home
 
 
@@ -769,10 +761,7 @@ class _Couplings:
             for body in self._bodies_of(*end)
         ):
             where = f"{self._document.path.name}: equality {name!r}"
-            why = "it connects the robot to a mocap body, which is not of the robot"
-            repair = "a constraint to a mocap body was left out"
-            fix = "remove it, if it is not needed"
-            self._findings.append(Finding("mocap-constraint", "warning", where, why, fix, repair))
+            self._findings.append(found("mocap-constraint", where))
         else:
             word = kind.name.removeprefix("mjEQ_").lower()
             raise self._document.error(

@@ -24,7 +24,7 @@ from morphgen.formats.resolve import (
 )
 from morphgen.formats.urdf.schema import CHILDREN, above_free_base, structure_findings
 from morphgen.formats.urdf.write import MORPHGEN_TAG, joined_capsules
-from morphgen.formats.xml import parse_description
+from morphgen.formats.xml import found, parse_description
 from morphgen.model import rotation
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import (
@@ -205,17 +205,17 @@ class _Meshes:
 
 def resolved_meshes(root: etree._Element, path: Path, finder: PackageFinder) -> _Meshes:
     """Find the files of all meshes; remove shapes without one, if the finder skips them."""
-    found: dict[str, FoundFile] = {}
+    known: dict[str, FoundFile] = {}
     missing: dict[str, Finding] = {}
     for element in root.iterfind(f"link/*/{_MESH}"):
         uri = element.get("filename", "")
-        if uri in found or uri in missing:
+        if uri in known or uri in missing:
             continue
         try:
-            found[uri] = _find_mesh(uri, root, path, finder)
+            known[uri] = _find_mesh(uri, root, path, finder)
         except FormatError as error:
-            where, fix = f"{path}:{element.sourceline}", f"correct the mesh path, {SKIP_HINT}"
-            missing[uri] = Finding("mesh-unresolved", "error", where, str(error), fix)
+            where, hint = f"{path}:{element.sourceline}", f", {SKIP_HINT}"
+            missing[uri] = found("mesh-unresolved", where, error=error, hint=hint)
     if missing and not finder.skip_missing:
         raise UnsoundError(str(path), list(missing.values()))
     skipped = 0
@@ -225,14 +225,13 @@ def resolved_meshes(root: etree._Element, path: Path, finder: PackageFinder) -> 
             if mesh is not None and mesh.get("filename") in missing:
                 link.remove(shape)
                 skipped += 1
-    packages, findings = _place_findings(found, str(path))
+    packages, findings = _place_findings(known, str(path))
     if missing:
         names = ", ".join(repr(shortened(uri)) for uri in [*missing][:5])
-        repair = f"{skipped} shapes were left out, because {len(missing)} meshes are missing"
         first = next(iter(missing.values()))
-        fix, repair = "give the meshes, and import the file again", f"{repair}: {names}"
-        findings.append(Finding("mesh-skipped", "warning", first.where, first.why, fix, repair))
-    files = {uri: file.path for uri, file in found.items()}
+        values = {"skipped": skipped, "missing": len(missing), "names": names}
+        findings.append(found("mesh-skipped", first.where, error=first.why, **values))
+    files = {uri: file.path for uri, file in known.items()}
     require_bounded_files(files.values(), str(path))
     return _Meshes(files, packages, findings)
 
@@ -255,41 +254,22 @@ def _find_mesh(uri: str, root: etree._Element, path: Path, finder: PackageFinder
 
 
 def _place_findings(
-    found: Mapping[str, FoundFile], origin: str
+    known: Mapping[str, FoundFile], origin: str
 ) -> tuple[list[dict[str, str]], list[Finding]]:
     """Return the installed packages of files, and findings about unexpected places, by package."""
     groups: dict[tuple[str, str], list[FoundFile]] = {}
-    for file in found.values():
+    for file in known.values():
         if file.place:
             groups.setdefault((file.place, file.package), []).append(file)
     packages, findings = [], []
     for (place, package), files in groups.items():
-        count, example = len(files), f"such as {files[0].path}"
+        values = {"package": package, "count": len(files), "example": files[0].path}
         if place == "installed":
             source = package_source(files[0])
             packages.append({"package": package, **source})
-            code, origin_of = "mesh-from-package", source["source"]
-            why = (
-                f"package {package!r} is not around the file; {count} meshes come from the one in "
-                f"{origin_of}, {example}"
-            )
-            fix = "put the meshes beside the file, if these are not the ones"
-            repair = (
-                f"{count} meshes of package {package!r} come from {origin_of}, "
-                f"licence {source['licence']}"
-            )
+            findings.append(found("mesh-from-package", origin, **values, **source))
         else:
-            code = "mesh-beside"
-            why = (
-                f"package {package!r} is not known; {count} of its meshes were found beside the "
-                f"file, {example}"
-            )
-            fix = f"name the folder of the file {package!r}, or name the package by --root"
-            repair = (
-                f"{count} meshes of the unknown package {package!r} were read from the file's own "
-                "folders"
-            )
-        findings.append(Finding(code, "warning", origin, why, fix, repair))
+            findings.append(found("mesh-beside", origin, **values))
     return packages, findings
 
 
@@ -386,10 +366,8 @@ def _named_colours(
     if not unknown:
         return colours, []
     names = ", ".join(dict.fromkeys(repr(shortened(m.get("name", ""))) for m in unknown[:5]))
-    where, fix = f"{origin}:{unknown[0].sourceline}", "define the material with a <color>"
-    why = f"{len(unknown)} shapes have a <material> that has no <color>: {names}"
-    repair = f"{len(unknown)} shapes have no colour, because their material has none: {names}"
-    return colours, [Finding("material-unknown", "info", where, why, fix, repair)]
+    where = f"{origin}:{unknown[0].sourceline}"
+    return colours, [found("material-unknown", where, count=len(unknown), names=names)]
 
 
 def _colour(material: etree._Element) -> Rgba | None:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from lxml import etree
 
 from morphgen.errors import nearest, shortened
-from morphgen.formats.xml import Attribute, read_schema
-from morphgen.model.findings import Finding, left_out
+from morphgen.formats.xml import Attribute, found, read_schema
+from morphgen.model.findings import Finding
 from morphgen.model.robot import JOINT_KINDS
 
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")  # neither NaN nor hex
@@ -34,18 +34,15 @@ _READ_CHILDREN = {
 _WITH_COMMAS = ("size", "scale")  # attributes that MuJoCo alone refuses with commas
 
 
-def _finding(
-    element: etree._Element, code: str, why: str, fix: str, repair: str = "", owner: str = ""
-) -> Finding:
-    """Return a finding at an element's line: a warning if reading repairs it, else an error.
+def _finding(element: etree._Element, row: str, owner: str = "", **values: Any) -> Finding:  # noqa: ANN401
+    """Return the finding of a row of ``findings.yaml`` at an element's line.
 
     It names the link, joint or other top-level element that contains the element.
     """
     top = [element, *element.iterancestors()][-2:][0]
     name = top.get("name")
     owner = owner or (f"{top.tag} {shortened(name)!r}" if name else f"{top.tag} without a name")
-    where = f":{element.sourceline} {owner}"
-    return Finding(code, "warning" if repair else "error", where, why, fix, repair)
+    return found(row, f":{element.sourceline} {owner}", **values)
 
 
 def unread_findings(root: etree._Element) -> Iterator[Finding]:
@@ -69,28 +66,28 @@ def unread_findings(root: etree._Element) -> Iterator[Finding]:
             if child not in deeper:
                 unread.setdefault((tag, "element", str(child.tag)), []).append(child)
         todo += reversed(deeper)
-    for (tag, kind, name), found in unread.items():
-        yield _unread_finding(tag, kind, name, found)
+    for (tag, kind, name), elements in unread.items():
+        yield _unread_finding(tag, kind, name, elements)
 
 
-def _unread_finding(tag: str, kind: str, name: str, found: list[etree._Element]) -> Finding:
-    first, local = found[0], etree.QName(name).localname if name else ""
+def _unread_finding(tag: str, kind: str, name: str, elements: list[etree._Element]) -> Finding:
+    first, local = elements[0], etree.QName(name).localname if name else ""
     valid: Sequence[str] = ()
-    what = f"{len(found)} text of <{tag}>"
+    what = f"{len(elements)} text of <{tag}>"
     if kind == "element":
         prefix = f"{first.prefix}:" if first.prefix else ""
-        what, valid = counted_elements(found, f"{prefix}{local}", tag), _READ_CHILDREN.get(tag, ())
+        what = counted_elements(elements, f"{prefix}{local}", tag)
+        valid = _READ_CHILDREN.get(tag, ())
     elif kind == "attribute":
         prefixes = {namespace: prefix for prefix, namespace in first.nsmap.items()}
         prefix = f"{prefixes.get(etree.QName(name).namespace)}:" if local != name else ""
-        what, valid = f"{len(found)} {prefix}{local}=... of <{tag}>", _READ_ATTRIBUTES.get(tag, ())
-    code, where = f"{kind}-unread", _finding(first, "", "", "").where
+        what = f"{len(elements)} {prefix}{local}=... of <{tag}>"
+        valid = _READ_ATTRIBUTES.get(tag, ())
     if name in _SCHEMA.left_out.split() or local != name:
-        return left_out(code, where, what)
+        return _finding(first, f"{kind}-unread/known", what=what)
     hint = nearest(shortened(name), valid) if valid else ""
     guess = f"{hint.partition('?')[0]}?" if "?" in hint else ""
-    fix, repair = "correct the name, or remove it", f"left out: {what}, not of URDF{guess}"
-    return Finding(code, "warning", where, f"{what}: not of URDF{hint}", fix, repair)
+    return _finding(first, f"{kind}-unread", what=what, hint=hint, guess=guess)
 
 
 def counted_elements(elements: Sequence[etree._Element], name: str, parent: str) -> str:
@@ -107,23 +104,21 @@ def content_findings(element: etree._Element) -> Iterator[Finding]:
         _number_faults(element, attribute) if attribute.counts else _text_faults(element, attribute)
         for attribute in _SCHEMA.attributes.get(tag, ())
     ]
-    for fault in chain(*checks, _missing_faults(element), _rotation_faults(element)):
-        yield _finding(element, *fault)
+    for row, values in chain(*checks, _missing_faults(element), _rotation_faults(element)):
+        yield _finding(element, row, **values)
     if tag == "geometry":
         yield from _geometry_findings(element)
     # `_robot_findings` checks the children of <robot>.
     for name, mark in () if tag == "robot" else CHILDREN.get(tag, {}).items():
         children = element.findall(name)
         if len(children) > 1 and mark != "*":
-            why = f"<{tag}> has {len(children)} <{name}>; the first one counts"
-            repair = f"of {len(children)} <{name}> the first one was taken"
-            yield _finding(children[1], "element-repeated", why, "keep one", repair)
+            values = {"tag": tag, "name": name, "count": len(children)}
+            yield _finding(children[1], "element-repeated", **values)
         for child in children:
             yield from content_findings(child)
 
 
-_Fault: TypeAlias = tuple[str, ...]
-"""Code, reason and advice of a finding about an element, and its repair if there is one."""
+_Fault: TypeAlias = tuple[str, Mapping[str, object]]  # row of a finding about an element, values
 
 
 def _text_faults(element: etree._Element, attribute: Attribute) -> Iterator[_Fault]:
@@ -132,21 +127,17 @@ def _text_faults(element: etree._Element, attribute: Attribute) -> Iterator[_Fau
     if not attribute.required:
         return
     if len(value) > MAX_TEXT or not value.isprintable():
-        why = (
-            f"<{tag} {name}={shortened(value)!r}> holds line breaks or other characters that "
-            f"cannot be printed, or more than {MAX_TEXT} characters"
-        )
-        yield "text-invalid", why, "write a shorter text of printable characters"
+        text = shortened(value)
+        yield "text-invalid", {"tag": tag, "name": name, "text": text, "most": MAX_TEXT}
     if not value.strip():
-        yield "attribute-missing", f"<{tag}> has no {name}", f'write <{tag} {name}="...">'
+        yield "attribute-missing", {"tag": tag, "name": name, "others": ""}
 
 
 def _missing_faults(element: etree._Element) -> Iterator[_Fault]:
     tag = element.tag
     for name, repair in _SCHEMA.expected.get(tag, {}).items():
         if element.find(name) is None:
-            why, fix = f"<{tag}> has no <{name}>", f"add <{name}> or drop <{tag}>"
-            yield "element-missing", why, fix, repair
+            yield "element-missing", {"tag": tag, "name": name, "repair": repair}
 
 
 def _geometry_findings(element: etree._Element) -> Iterator[Finding]:
@@ -154,20 +145,15 @@ def _geometry_findings(element: etree._Element) -> Iterator[Finding]:
     tags = ", ".join(f"<{name}>" for name in kinds)
     shapes = [child for child in element if isinstance(child.tag, str)]
     if not shapes:
-        fix, repair = f"put one of {tags} into it", "a shape with an empty <geometry> was left out"
-        yield _finding(element, "geometry-missing", "<geometry> is empty", fix, repair)
+        yield _finding(element, "geometry-missing", tags=tags)
         return
     known = [shape for shape in shapes if shape.tag in kinds]
     for shape in shapes:
         if shape not in known:
             tag = f"<{shortened(shape.tag)}>"
-            why, fix = f"{tag} is not a geometry of URDF", f"use one of {tags}"
-            yield _finding(shape, "geometry-unknown", why, fix, f"the geometry {tag} was left out")
+            yield _finding(shape, "geometry-unknown", tag=tag, tags=tags)
     if len(known) > 1:
-        why = f"<geometry> holds {len(known)} shapes; the first one counts"
-        fix = "give each its own <visual> or <collision>"
-        repair = f"of {len(known)} shapes in one <geometry> the first one was taken"
-        yield _finding(known[1], "element-repeated", why, fix, repair)
+        yield _finding(known[1], "element-repeated/geometry", count=len(known))
 
 
 def _number_faults(element: etree._Element, attribute: Attribute) -> Iterator[_Fault]:
@@ -175,39 +161,33 @@ def _number_faults(element: etree._Element, attribute: Attribute) -> Iterator[_F
     text = element.get(name)
     if text is None:
         if attribute.required:
-            why = f"<{element.tag}> has no {name}{_others(element)}"
-            yield "attribute-missing", why, f'write <{element.tag} {name}="...">'
+            values = {"tag": element.tag, "name": name, "others": _others(element)}
+            yield "attribute-missing", values
         return
     shown = f'<{element.tag} {name}="{shortened(text)}">'
     words = text.replace(",", " ").split() if max(counts) > 1 else text.split()
     wrong = [w for w in words if not (_DECIMAL.fullmatch(w) and math.isfinite(float(w)))]
     if wrong:
-        why = f"{shown}: {shortened(wrong[0])!r} is not a finite decimal number"
-        fix = "write decimal numbers with a point, separated by spaces"
-        yield "number-malformed", why, fix
+        yield "number-malformed", {"shown": shown, "word": shortened(wrong[0])}
         return
     if len(words) not in counts:
         surplus = name == "scale" and len(words) > max(counts)  # some exporters write them
-        repair = f"of {shown} the first {max(counts)} numbers were taken" if surplus else ""
-        fix = f"write {' or '.join(map(str, counts))}"
-        yield "number-count", f"{shown} holds {len(words)} numbers", fix, repair
+        expected = {"counts": " or ".join(map(str, counts)), "most": max(counts)}
+        fault = {"shown": shown, "count": len(words), "repairable": surplus}
+        yield "number-count", fault | expected
         if not surplus:
             return
         words = words[: max(counts)]
     if "," in text:
-        why = f"{shown} separates numbers by commas, which MuJoCo refuses"
-        repair = f"the commas of {shown} were read as spaces" if name in _WITH_COMMAS else ""
-        yield "number-commas", why, "separate them by spaces", repair
-    values = [float(word) for word in words]
-    if max(map(abs, values)) > MAX_NUMBER or (attribute.positive and 0 < min(values) < MIN_LENGTH):
-        fix = f"write numbers up to {MAX_NUMBER:g} and lengths from {MIN_LENGTH:g}, in SI units"
-        yield "number-absurd", f"{shown} is out of range", fix
-    if attribute.positive and min(values) <= 0:
-        repair = f"the shape {shown} was left out" if min(values) == 0 else ""
-        fix = "write lengths above 0, in metres"
-        yield "size-not-positive", f"{shown} is not positive", fix, repair
-    if name == "scale" and 0.0 in values:
-        yield "mesh-scale-invalid", f"{shown} flattens the mesh", "write factors other than 0"
+        yield "number-commas", {"shown": shown, "repairable": name in _WITH_COMMAS}
+    numbers = [float(word) for word in words]
+    is_short = attribute.positive and 0 < min(numbers) < MIN_LENGTH
+    if max(map(abs, numbers)) > MAX_NUMBER or is_short:
+        yield "number-absurd", {"shown": shown, "most": MAX_NUMBER, "least": MIN_LENGTH}
+    if attribute.positive and min(numbers) <= 0:
+        yield "size-not-positive", {"shown": shown, "repairable": min(numbers) == 0}
+    if name == "scale" and 0.0 in numbers:
+        yield "mesh-scale-invalid", {"shown": shown}
 
 
 def _rotation_faults(element: etree._Element) -> Iterator[_Fault]:
@@ -216,8 +196,7 @@ def _rotation_faults(element: etree._Element) -> Iterator[_Fault]:
         (element.get("rpy") and element.get("quat_xyzw"))
         or not any(float(w) for w in quaternion if _DECIMAL.fullmatch(w))
     ):
-        fix = "write one rotation, as a quaternion of length 1 or as rpy"
-        yield "rotation-invalid", "its quat_xyzw is zero, or beside rpy", fix
+        yield "rotation-invalid", {}
 
 
 def _others(element: etree._Element) -> str:
@@ -255,11 +234,9 @@ def _document_findings(root: etree._Element) -> list[Finding]:
     # their likely cause, and reported alone.
     broken = any(finding.severity == "error" for finding in findings)
     name = f"<xacro:{etree.QName(unexpanded).localname}>"
-    why = f"{name} is left in the document"
-    fix = "give the file the suffix .xacro, or expand it first"
-    repair = "" if broken else f"{name} was left out"
     owner = f"robot {shortened(root.get('name', ''))!r}" if root.get("name") else ""
-    xacro_finding = _finding(unexpanded, "xacro-unexpanded", why, fix, repair, owner)
+    values = {"name": name, "repairable": not broken}
+    xacro_finding = _finding(unexpanded, "xacro-unexpanded", owner, **values)
     return [xacro_finding] if broken else [xacro_finding, *findings]
 
 
@@ -272,9 +249,7 @@ def _size_findings(root: etree._Element) -> Iterator[Finding]:
     ):
         count = sum(1 for _ in elements)
         if count > max_count:
-            why = f"it has {count} <{tag}> elements; at most {max_count} are read"
-            fix = "leave out everything that is not part of the robot"
-            yield _finding(root, "robot-too-large", why, fix)
+            yield _finding(root, "robot-too-large", count=count, tag=tag, most=max_count)
 
 
 def _first(findings: Iterator[Finding]) -> list[Finding]:
@@ -293,7 +268,7 @@ def _robot_findings(root: etree._Element) -> Iterator[Finding]:
     links, joints = root.findall("link"), root.findall("joint")
     yield from content_findings(root)
     if not links:
-        yield _finding(root, "link-missing", "<robot> has no <link>", "add at least one link")
+        yield _finding(root, "link-missing")
     yield from _duplicates(links)
     yield from _duplicates(joints)
     yield from _tree(links, joints)
@@ -305,15 +280,14 @@ def _robot_findings(root: etree._Element) -> Iterator[Finding]:
 
 def _wrong_root(root: etree._Element) -> Finding:
     name = etree.QName(root)
-    fix = "give a URDF or xacro, whose root element is <robot>, or an MJCF, whose is <mujoco>"
     tag = f"{root.prefix}:{name.localname}" if root.prefix else name.localname
-    why = f"the root element is <{tag}>, not <robot>"
+    row = "root-not-robot"
     if root.prefix:
-        fix = f"remove the prefix {root.prefix!r} from all elements; robot software reads none"
+        row = "root-not-robot/prefix"
     elif name.localname == "robot":
-        why = f"the root element <robot> is in the namespace {shortened(str(name.namespace))!r}"
-        fix = "remove xmlns=... from it"
-    return _finding(root, "root-not-robot", why, fix, owner=f"<{tag}>")
+        row = "root-not-robot/namespace"
+    namespace = shortened(str(name.namespace))
+    return _finding(root, row, f"<{tag}>", tag=tag, prefix=root.prefix, namespace=namespace)
 
 
 def _first_xacro(root: etree._Element) -> etree._Element | None:
@@ -329,8 +303,8 @@ def _duplicates(elements: Sequence[etree._Element]) -> Iterator[Finding]:
     for element in elements:
         name = element.get("name")
         if name in first:
-            why = f"the name is taken by the {element.tag} on line {first[name].sourceline}"
-            yield _finding(element, f"{element.tag}-duplicate", why, "rename one of them")
+            values = {"kind": element.tag, "line": first[name].sourceline}
+            yield _finding(element, f"{element.tag}-duplicate", **values)
         elif name:
             first[name] = element
 
@@ -351,28 +325,23 @@ def _tree(links: Sequence[etree._Element], joints: Sequence[etree._Element]) -> 
         parent, child = _ends(joint)
         for role, name in (("parent", parent), ("child", child)):
             if name and name not in by_name:
-                why = f"its {role} {name!r} is not a link"
-                fix = f"name a link{nearest(name, by_name)}"
-                yield _finding(joint, "joint-link-unknown", why, fix)
+                values = {"role": role, "name": name, "hint": nearest(name, by_name)}
+                yield _finding(joint, "joint-link-unknown", **values)
         if not child or child not in by_name:
             continue
         if child in joint_above:
-            other = f"{joint_above[child].get('name')!r} (line {joint_above[child].sourceline})"
-            why = f"link {child!r} is already the child of joint {other}"
-            fix = "remove one joint: a robot is a tree, loops are not supported"
-            yield _finding(joint, "link-two-parents", why, fix)
+            other = joint_above[child]
+            values = {"child": child, "other": other.get("name"), "line": other.sourceline}
+            yield _finding(joint, "link-two-parents", **values)
             continue
         joint_above[child] = joint
         if parent in by_name:
             parent_of[child] = parent
     for cycle in _cycles(parent_of):
-        why = "links form a loop: " + " -> ".join([*cycle, cycle[0]])
-        yield _finding(joint_above[cycle[0]], "cycle", why, "remove one of the joints")
+        yield _finding(joint_above[cycle[0]], "cycle", chain=" -> ".join([*cycle, cycle[0]]))
     roots = [name for name in by_name if name not in joint_above]
     for name in roots[1:]:
-        why = f"no joint attaches it, nor the root {roots[0]!r}; a tree has one root"
-        fix = "attach it by a fixed joint, or remove it"
-        yield _finding(by_name[name], "disconnected", why, fix)
+        yield _finding(by_name[name], "disconnected", root=roots[0])
 
 
 def _cycles(parent_of: dict[str, str]) -> Iterator[list[str]]:
@@ -431,19 +400,14 @@ def _kinds(root: etree._Element) -> Iterator[Finding]:
             links = [element for element in left_out if element.tag == "link"]
             names = ", ".join(repr(link.get("name")) for link in links[:5])
             shapes = sum(1 for link in links for _ in link.iterchildren("visual", "collision"))
-            why = f"it is {kind} and lets the whole robot move; the base of a robot is fixed"
-            fix = "attach the robot by a joint of type fixed, if it stands"
-            repair = (
-                f"joint {joint.get('name')!r} of type {kind} and {len(links)} links above it with "
-                f"{shapes} shapes, {names}, were left out"
-            )
-            yield _finding(joint, "base-free", why, fix, repair)
+            values = {"count": len(links), "shapes": shapes, "names": names}
+            yield _finding(joint, "base-free", joint=joint.get("name"), kind=kind, **values)
         elif kind in _REPLACEMENT:
-            why = f"joints of type {kind!r} are not supported"
-            yield _finding(joint, "joint-type-unsupported", why, _REPLACEMENT[kind])
+            replacement = _REPLACEMENT[kind]
+            yield _finding(joint, "joint-type-unsupported", kind=kind, replacement=replacement)
         elif kind and kind not in JOINT_KINDS:
-            why, fix = f"{kind!r} is not a joint type", f"use one{nearest(kind, JOINT_KINDS)}"
-            yield _finding(joint, "joint-type-unknown", why, fix)
+            hint = nearest(kind, JOINT_KINDS)
+            yield _finding(joint, "joint-type-unknown", kind=kind, hint=hint)
 
 
 def _mimics(joints: Sequence[etree._Element]) -> Iterator[Finding]:
@@ -457,10 +421,7 @@ def _mimics(joints: Sequence[etree._Element]) -> Iterator[Finding]:
         if leader in by_name:
             leader_of[name] = leader
         else:
-            unknown = f"{leader!r}, which is not a joint"
-            fix = f"name a joint{nearest(leader, by_name)}"
-            repair = f"its <mimic> of {unknown}, was left out: it moves independently"
-            yield _finding(mimic, "mimic-unknown", f"it mimics {unknown}", fix, repair)
+            hint = nearest(leader, by_name)
+            yield _finding(mimic, "mimic-unknown", leader=leader, hint=hint)
     for cycle in _cycles(leader_of):
-        why = "joints mimic each other: " + " -> ".join([*cycle, cycle[0]])
-        yield _finding(by_name[cycle[0]], "mimic-cycle", why, "let one of them move independently")
+        yield _finding(by_name[cycle[0]], "mimic-cycle", chain=" -> ".join([*cycle, cycle[0]]))
