@@ -15,7 +15,7 @@ it if the robots are the same.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from morphgen.benchmark.generate import parse_bound
 from morphgen.benchmark.hold_out import has_hold_out_rules, hold_out_findings
-from morphgen.benchmark.regimes import regime_findings
+from morphgen.benchmark.regimes import found, regime_findings
 from morphgen.benchmark.survey import (
     Fault,
     NearestTrain,
@@ -38,7 +38,7 @@ from morphgen.encoding.robot_hash import robot_hash
 from morphgen.encoding.similarity import NEAR_THRESHOLDS, NearThresholds, is_same_reach
 from morphgen.errors import MorphgenError, nearest
 from morphgen.grammar.library import Library
-from morphgen.model.findings import Finding, Severity
+from morphgen.model.findings import Finding
 from morphgen.processes import parallel_map
 from morphgen.progress import stage
 from morphgen.splits.split import SIDES, Member, Side, Split, sided_members
@@ -55,28 +55,6 @@ from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, member_with_primitives
 from morphgen.tasks.task import GoalSet
 from morphgen.typing import Array
-
-_FIXES = {
-    "part-missing": "name the folder of your parts with --library, or correct the derivation",
-    "links-many": "leave it out, or make the split with --max-links, the same for all robots",
-    "body-broken": "correct the derivation, or the part",
-    "body-changed": "use the morphgen that the split was made with, or make the split anew",
-    "body-shared": "leave it out of one side",
-    "body-near": "draw another test robot, or accept it with a reason",
-    "body-repeated": "leave one out",
-    "similarity-bound": "draw another test robot, or correct what the split says of its making",
-    "name-shared": "rename one: what is stored by name, such as goals, would pass for the other's",
-    "task-unknown": "correct the task, or install the package that has it",
-    "goals-missing": "leave the robot out, or build again: morphgen split build --goals",
-    "goals-unknown": "build the goal sets again",
-    "goals-body": "build the goal sets again",
-    "goals-seed": "build the goal sets again, with the seed of the split",
-    "goals-config": "build the goal sets again, with one morphgen",
-    "goals-changed": "build the goal sets again",
-    "goals-unproven": "build the goal sets again",
-    "goals-shared": "leave the robot out of one side, or accept it with a reason",
-    "goals-repeated": "take another --goal-seed, or accept it with a reason",
-}
 
 
 @dataclass(frozen=True)
@@ -161,18 +139,14 @@ def _conclude(
     split: Split,
     findings: Sequence[Finding],
     nearest: Mapping[str, Mapping[str, NearestTrain]],
-    not_audited: Collection[str] = (),
+    not_audited: tuple[str, ...] = (),  # beginnings of codes that nothing looked for
 ) -> Audit:
-    """Return an audit from all findings: those that the split accepts are set apart.
-
-    not_audited: Codes that may be accepted although nothing looked for them.
-    """
+    """Return an audit from all findings: those that the split accepts are set apart."""
     codes = {finding.code for finding in findings}
-    why = "the split accepts it, but nothing of that code is found"
     unused = (
-        Finding("accepted-unused", "warning", f"accepted {code}", why, "delete the entry")
+        found("accepted-unused", f"accepted {code}")
         for code in split.accepted
-        if code not in codes and code not in not_audited
+        if code not in codes and not code.startswith(not_audited)
     )
     remaining = (finding for finding in findings if finding.code not in split.accepted)
     accepted = (finding for finding in findings if finding.code in split.accepted)
@@ -187,13 +161,11 @@ def _conclude(
 def _robot_findings(survey: SplitSurvey) -> Iterator[Finding]:
     """Yield robots that cannot be composed, or that have changed."""
     for side, member, robot in _robots(survey):
+        where = f"{side} robot {member.name}"
         if isinstance(robot, Fault):
-            yield _finding(robot.code, side, member.name, robot.why)
-        elif robot.robot_hash != member.robot_hash:
-            why = (
-                f"the split names body {member.robot_hash}, its derivation gives {robot.robot_hash}"
-            )
-            yield _finding("body-changed", side, member.name, why)
+            yield found(robot.code, where, why=robot.why)
+        elif (given := robot.robot_hash) != member.robot_hash:
+            yield found("body-changed", where, named=member.robot_hash, given=given)
 
 
 def _leaks(survey: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
@@ -204,28 +176,23 @@ def _leaks(survey: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
     is_one_workspace = _same_reach(survey, near) & (workspace > near.workspace)
     is_near = (tree < near.tree) & ((cosine > near.cosine) | is_one_workspace)
     for j, member in enumerate(split.test):
+        where = f"test robot {member.name}"
         rivals = [i for i, other in enumerate(split.train) if other.task == member.task]
         shared = [i for i in rivals if split.train[i].robot_hash == member.robot_hash]
         if shared:
-            twin = _first_of(split, shared)
-            why = f"train robot {twin} has the same body, and learns the same task"
-            yield _finding("body-shared", "test", member.name, why)
+            yield found("body-shared", where, twin=_first_of(split, shared))
         duplicates = sorted(
             (i for i in rivals if is_near[i, j] and i not in shared), key=tree[:, j].item
         )
         if duplicates:
             first = duplicates[0]
-            why = (
-                f"train robot {_first_of(split, duplicates)} is nearly the same: tree distance "
-                f"{tree[first, j]:.2g} (below {near.tree:g}), cosine {cosine[first, j]:.6f} and "
-                f"workspace overlap {workspace[first, j]:.4f} (one above {near.cosine:g} or "
-                f"{near.workspace:g}, the latter at the same reach)"
-            )
-            yield _finding("body-near", "test", member.name, why)
+            measures = {"tree": tree, "cosine": cosine, "workspace": workspace}
+            values = {name: matrix[first, j] for name, matrix in measures.items()}
+            twin = _first_of(split, duplicates)
+            yield found("body-near", where, twin=twin, near=near, **values)
         other = names.get(member.name)
         if other is not None and other.robot_hash != member.robot_hash:
-            why = "a train robot of another body has the same name"
-            yield _finding("name-shared", "test", member.name, why)
+            yield found("name-shared", where)
 
 
 def _same_reach(survey: SplitSurvey, near: NearThresholds) -> NDArray[np.bool_]:
@@ -240,15 +207,14 @@ def _same_reach(survey: SplitSurvey, near: NearThresholds) -> NDArray[np.bool_]:
 
 def _repeated(split: Split) -> Iterator[Finding]:
     """Yield robots that a side has twice."""
-    severity: Severity = "error" if has_hold_out_rules(split) else "warning"
+    row = "body-repeated" if has_hold_out_rules(split) else "body-repeated/chosen"
     for side in SIDES:
         first: dict[tuple[object, ...], str] = {}
         for member in split.side(side):
             key = (member.robot_hash, member.task, member.obstacles)
             earlier = first.setdefault(key, member.name)
             if earlier != member.name:
-                why = f"{side} robot {earlier} has the same body and task"
-                yield _finding("body-repeated", side, member.name, why, severity)
+                yield found(row, f"{side} robot {member.name}", side=side, earlier=earlier)
 
 
 def _regime_findings(survey: SplitSurvey, library: Library) -> tuple[Finding, ...]:
@@ -275,11 +241,8 @@ def _bound_findings(survey: SplitSurvey) -> Iterator[Finding]:
     for member, cosines in zip(survey.split.test, survey.by_measure("cosine").T, strict=True):
         largest = max(cosines[~np.isnan(cosines)].tolist(), default=None)
         if largest is not None and not bound.holds(largest):
-            why = (
-                f"its cosine to the nearest train robot is {largest:.3f}, and the split was made "
-                f"with {bound}"
-            )
-            yield _finding("similarity-bound", "test", member.name, why)
+            where = f"test robot {member.name}"
+            yield found("similarity-bound", where, cosine=largest, bound=bound)
 
 
 def _robots(survey: SplitSurvey) -> Iterator[tuple[Side, Member, SurveyedRobot | Fault]]:
@@ -291,10 +254,6 @@ def _first_of(split: Split, indices: Sequence[int]) -> str:
     """Return the name of the first of some train robots, and how many more there are."""
     more = f" (and {len(indices) - 1} more)" if indices[1:] else ""
     return split.train[indices[0]].name + more
-
-
-def _finding(code: str, side: Side, name: str, why: str, severity: Severity = "error") -> Finding:
-    return Finding(code, severity, f"{side} robot {name}", why, _FIXES[code])
 
 
 Mask = NDArray[np.bool_]
@@ -365,15 +324,14 @@ def with_goal_findings(audit: Audit, split: Split, findings: Sequence[Finding] |
 
     A task that is unknown here is found, too: error ``task-unknown``.
     """
-    found = [finding for finding in audit.findings if finding.code != "accepted-unused"]
-    found += [finding for finding, _ in audit.accepted]
+    known = [finding for finding in audit.findings if finding.code != "accepted-unused"]
+    known += [finding for finding, _ in audit.accepted]
     for side, member in sided_members(split):
-        if member.task not in TASKS:
-            reason = f"its task {member.task!r} is unknown{nearest(member.task, TASKS)}"
-            found.append(_finding("task-unknown", side, member.name, reason))
-    goal_codes = [code for code in _FIXES if code.startswith(("goals-", "task-"))]
-    not_audited = goal_codes if findings is None else ()
-    joined = _conclude(split, [*found, *(findings or ())], audit.nearest, not_audited)
+        if (task := member.task) not in TASKS:
+            where = f"{side} robot {member.name}"
+            known.append(found("task-unknown", where, task=task, nearest=nearest(task, TASKS)))
+    not_audited = ("goals-", "task-unknown") if findings is None else ()
+    joined = _conclude(split, [*known, *(findings or ())], audit.nearest, not_audited)
     return replace(joined, goals=audit.goals)
 
 
@@ -434,20 +392,18 @@ def _set_findings(
         if one.key
     }
     for (side, member), one in zip(members, examined, strict=True):
-        result = goals.sets.get((side, member.name))
+        result, where = goals.sets.get((side, member.name)), f"{side} robot {member.name}"
         if one.error or result is None or result.goals is None:
-            reason = one.error or "it has no goal set"
-            yield _finding("goals-missing", side, member.name, reason)
+            yield found("goals-missing", where, why=one.error or "it has no goal set")
             continue
-        mismatch = _mismatch(result, result.goals, member, one, owners, goals.config)
-        if mismatch:
-            yield _finding(mismatch[0], side, member.name, mismatch[1])
+        if mismatch := _mismatch(result, result.goals, member, one, owners, goals.config):
+            yield found(mismatch[0], where, **mismatch[1])
         if errors := one.certificate_errors:
             more = f" (and {len(errors) - 1} more)" if errors[1:] else ""
-            yield _finding("goals-unproven", side, member.name, errors[0] + more)
+            yield found("goals-unproven", where, error=errors[0], more=more)
     members_of_split = {(side, member.name) for side, member in members}
     for side, name in sorted(goals.sets.keys() - members_of_split):
-        yield _finding("goals-unknown", side, name, f"split {split.name} has no such robot")
+        yield found("goals-unknown", f"{side} robot {name}", split=split.name)
 
 
 def _mismatch(
@@ -457,27 +413,22 @@ def _mismatch(
     examined: _Examination,
     owners: Mapping[str, str],
     config: GoalConfig,
-) -> tuple[str, str] | None:
-    """Return the code and reason if a set is not the one that is sampled for its member."""
+) -> tuple[str, dict[str, object]] | None:
+    """Return the finding and its values if a set is not the one sampled for its member."""
     if goals.key == examined.key and result.robot_hash == examined.robot_hash:
-        reason = f"its goals are not those that seed {config.seed} gives"
-        return None if examined.is_same else ("goals-changed", reason)
+        return None if examined.is_same else ("goals-changed", {"seed": config.seed})
     if goals.key != examined.key and goals.key in owners:
-        return "goals-body", f"its set is that of {owners[goals.key]}"
+        return "goals-body/other", {"owner": owners[goals.key]}
     if result.robot_hash != examined.robot_hash:
-        reason = f"its set is of body {result.robot_hash}, not of {examined.robot_hash}"
-        return "goals-body", reason
+        return "goals-body", {"stored": result.robot_hash, "expected": examined.robot_hash}
     if goals.seed != config.seed:
-        reason = f"its set was made with seed {goals.seed}, the split's with {config.seed}"
-        return "goals-seed", reason
+        return "goals-seed", {"seed": goals.seed, "expected": config.seed}
     made_for = _task_text(result.task, bool(goals.obstacles))
     expected = _task_text(member.task, member.obstacles)
     if made_for != expected:
-        return "goals-config", f"its set is for {made_for}, not {expected}"
-    return "goals-config", (
-        f"its set, of {len(goals.q)} goals, was made with other constants or another version: its "
-        f"key is {goals.key[:8]}, not {examined.key[:8]}"
-    )
+        return "goals-config/task", {"made_for": made_for, "expected": expected}
+    values = {"count": len(goals.q), "key": goals.key, "expected": examined.key}
+    return "goals-config", values
 
 
 def _task_text(task: str, obstacles: bool) -> str:
@@ -495,10 +446,10 @@ def _shared_goals(split: Split, goals: SplitGoals) -> Iterator[Finding]:
                 count, noun = _num_shared(test, train, rival.robot_hash == member.robot_hash)
                 leaks += [(count, noun, rival.name)] if count else []
         if test is not None and leaks:
-            count, noun, name = max(leaks, key=lambda leak: leak[0])
-            more = f" (and {len(leaks) - 1} more)" if leaks[1:] else ""
-            reason = f"train robot {name}{more} has {count} of its {len(test.q)} {noun}"
-            yield _finding("goals-shared", "test", member.name, reason)
+            count, noun, train_name = max(leaks, key=lambda leak: leak[0])
+            train_name += f" (and {len(leaks) - 1} more)" if leaks[1:] else ""
+            values = {"train": train_name, "count": count, "of": len(test.q), "noun": noun}
+            yield found("goals-shared", f"test robot {member.name}", **values)
 
 
 def _num_shared(test: GoalSet, train: GoalSet, same_robot: bool) -> tuple[int, str]:
@@ -528,8 +479,8 @@ def _repeated_goals(split: Split, goals: SplitGoals) -> Iterator[Finding]:
         pairs = np.argwhere(np.triu(same, 1)).tolist()
         if pairs:
             more = f" (and {len(pairs) - 1} more pairs)" if pairs[1:] else ""
-            reason = f"goals {pairs[0][0]} and {pairs[0][1]} of its set are the same{more}"
-            yield _finding("goals-repeated", side, member.name, reason, "warning")
+            where = f"{side} robot {member.name}"
+            yield found("goals-repeated", where, first=pairs[0], more=more)
 
 
 def _near(a: Array, b: Array) -> Mask:

@@ -151,7 +151,7 @@ def _drawn_splits(
         """Return the reason of the first finding that an audit would have; empty if none."""
         test = RuledRobot("", COMPOSED, "", derivation, library)
         found = (regime_violations(regime, provenance, test, side) for side in parsed)
-        return next((_REASONS[code] for code, _, _ in itertools.chain(*found)), "")
+        return next((_REASONS[finding.code] for finding in itertools.chain(*found)), "")
 
     def refused(robot: Candidate) -> str:
         if twin := name_by_hash.get(robot.hash):

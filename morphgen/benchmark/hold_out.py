@@ -26,7 +26,7 @@ from morphgen.benchmark.generate import (
     assemble_drawn,
     require_size,
 )
-from morphgen.benchmark.regimes import NOTHING, PatternRobot, parts, pattern_robots
+from morphgen.benchmark.regimes import NOTHING, PatternRobot, found, parts, pattern_robots
 from morphgen.encoding.similarity import is_near
 from morphgen.errors import BenchmarkError, PartError, nearest
 from morphgen.formats.rounding import format_number
@@ -45,7 +45,7 @@ from morphgen.splits.candidates import (
     SampledRecipe,
     UnfitRobotError,
 )
-from morphgen.splits.split import HOLD_OUT, HOLD_OUT_KEY, Member, Side, Split
+from morphgen.splits.split import HOLD_OUT, HOLD_OUT_KEY, Split
 
 MANUFACTURER = "manufacturer"  # key of conditions on the manufacturer of a part
 EXAMPLES = "arm=kinova*, manufacturer=Kinova, arm3.length=0.3..0.4 or arm=ur5+ee=plane"
@@ -633,22 +633,18 @@ def hold_out_findings(split: Split, library: Library) -> Iterator[Finding]:
         for rule in rules:
             if rule.holds(derivation, library):
                 names = ", ".join(sorted(rule.matching_parts(derivation, library)))
-                why = f"it has {names}, and the split holds out {rule}"
-                yield _finding("held-out-trained", "train", member, why, "leave it out of train")
+                where = f"train robot {member.name}"
+                yield found("held-out-trained", where, parts=names, rule=rule)
     for member, derivation in test:
+        where = f"test robot {member.name}"
         if not any(rule.holds(derivation, library) for rule in rules):
-            why = f"it has nothing that the split holds out: {', '.join(map(str, rules))}"
-            yield _finding("held-out-absent", "test", member, why, "leave it out of test")
+            yield found("held-out-absent", where, rules=", ".join(map(str, rules)))
         unseen = parts(derivation) - trained - held_out_parts(rules, derivation, library)
         if unseen:
-            why = f"no train robot has {', '.join(map(repr, sorted(unseen)))}, which no rule names"
-            fix = "train on a robot that has it, or hold it out, too"
-            yield _finding("part-unseen", "test", member, why, fix)
+            yield found("part-unseen/rule", where, parts=", ".join(map(repr, sorted(unseen))))
     for rule in rules:
         if not any(rule.holds(derivation, library) for _, derivation in test):
-            why = "no test robot has what it holds out"
-            fix = "add a test robot that has it, or delete the rule"
-            yield Finding("held-out-untested", "error", f"rule {rule}", why, fix)
+            yield found("held-out-untested", f"rule {rule}")
 
 
 def related_parts(split: Split, library: Library) -> dict[str, tuple[str, ...]]:
@@ -677,10 +673,6 @@ def related_parts(split: Split, library: Library) -> dict[str, tuple[str, ...]]:
         if manifest.manufacturer and same:
             related[f"{manifest.kind}.manufacturer={manifest.manufacturer}"] = tuple(same)
     return related
-
-
-def _finding(code: str, side: Side, member: Member, why: str, fix: str) -> Finding:
-    return Finding(code, "error", f"{side} robot {member.name}", why, fix)
 
 
 DEFAULT_PATTERN = "arm=* ee=*"  # robots that are drawn from if nothing is named

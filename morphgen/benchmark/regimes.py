@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import scipy  # loads its packages at their first use, which take seconds
@@ -22,13 +23,14 @@ from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import MOUNT_YAW
 from morphgen.grammar.request import SLOTS
-from morphgen.model.findings import Finding
+from morphgen.model.findings import Finding, texts_of
 from morphgen.splits.candidates import Candidate, DerivedRecipe, recipe_of
 from morphgen.splits.split import COMPOSED, Member, Regime, Split
 
 NOTHING = "none"  # name of the part for robots without an end-effector
 _CHOICE = re.compile(r"\{([^{}]*)\}")
 _WILDCARD = re.compile(r"[*?[]")
+found = texts_of(Path(__file__).with_name("findings.yaml"))
 
 
 @dataclass(frozen=True)
@@ -196,14 +198,13 @@ def regime_findings(split: Split, library: Library) -> tuple[Finding, ...]:
     """
     train = [RuledRobot.of(member, library) for member in split.train]
     test = [RuledRobot.of(member, library) for member in split.test]
-    return tuple(
-        Finding(code, "error", f"test robot {robot.name}", why, fix)
-        for robot in test
-        for code, why, fix in (
-            *_task_violations(robot, train),
-            *regime_violations(split.regime, split.provenance, robot, train),
-        )
-    )
+    tasks = {robot.task for robot in train}
+    findings: list[Finding] = []
+    for robot in test:
+        if robot.task not in tasks:
+            findings.append(found("task-unseen", robot.where, task=robot.task))
+        findings += regime_violations(split.regime, split.provenance, robot, train)
+    return tuple(findings)
 
 
 @dataclass(frozen=True)
@@ -223,6 +224,11 @@ class RuledRobot:
             return cls(robot.name, robot.category, "", robot.derivation, library)
         derivation = parse_derivation(robot.derivation, f"derivation of {robot.name!r}")
         return cls(robot.name, robot.category, robot.task, derivation, library)
+
+    @property
+    def where(self) -> str:
+        """The test robot as the place of a finding."""
+        return f"test robot {self.name}"
 
     @cached_property
     def structure(self) -> str:
@@ -256,12 +262,9 @@ class RuledRobot:
         return list(parameters(self.derivation, self.library).values())
 
 
-Violation = tuple[str, str, str]  # code, reason and fix of what a test robot violates
-
-
 def regime_violations(
     regime: Regime, provenance: Mapping[str, object], test: RuledRobot, train: Sequence[RuledRobot]
-) -> Iterator[Violation]:
+) -> Iterator[Finding]:
     """Yield how a test robot violates the rule of a regime; see ``regime_findings``.
 
     Generators draw another robot where an audit would have a finding.
@@ -273,72 +276,38 @@ def regime_violations(
     return _extrapolation(test, train) if regime == "extrapolation" else iter(())
 
 
-def _interpolation(hull: str, test: RuledRobot, train: Sequence[RuledRobot]) -> Iterator[Violation]:
+def _interpolation(hull: str, test: RuledRobot, train: Sequence[RuledRobot]) -> Iterator[Finding]:
     same_structure = [robot for robot in train if robot.structure == test.structure]
     if not same_structure:
-        yield (
-            "structure-unseen",
-            f"no train robot has its structure, {test.structure}",
-            "draw test robots from the grammar of train robots",
-        )
+        yield found("structure-unseen", test.where, structure=test.structure)
         return
     if hull not in HULLS[:2]:
         return
     distance = hull_distance(test.parameters, [robot.parameters for robot in same_structure])
     if (distance <= ON_HULL) != (hull == "inside"):
-        is_where = "inside" if distance <= ON_HULL else f"outside, by {distance:.3g} ranges,"
-        yield (
-            "hull",
-            f"its parameters lie {is_where} of the convex hull of the {len(same_structure)} train "
-            f"robots of its structure; the split says {hull}",
-            "draw another test robot",
-        )
+        lie = "inside" if distance <= ON_HULL else f"outside, by {distance:.3g} ranges,"
+        yield found("hull", test.where, lie=lie, count=len(same_structure), hull=hull)
 
 
-def _composition(test: RuledRobot, train: Sequence[RuledRobot]) -> Iterator[Violation]:
+def _composition(test: RuledRobot, train: Sequence[RuledRobot]) -> Iterator[Finding]:
     unseen = sorted(test.parts.difference(*(robot.parts for robot in train)))
     if unseen:
-        yield (
-            "part-unseen",
-            f"no train robot has {', '.join(map(repr, unseen))}",
-            "train on a robot that has it, or test another",
-        )
+        yield found("part-unseen", test.where, parts=", ".join(map(repr, unseen)))
     twin = next((robot.name for robot in train if robot.combination == test.combination), None)
     if twin:
-        yield (
-            "combination-seen",
-            f"train robot {twin} is the same combination, {test.combination}",
-            "leave the combination out of train",
-        )
+        yield found("combination-seen", test.where, twin=twin, combination=test.combination)
     if len({robot.task for robot in train}) > 1 and not unseen:
         task = test.task
         if not test.parts.difference(*(robot.parts for robot in train if robot.task == task)):
-            yield (
-                "pair-seen",
-                f"every part of it is in a train robot that learns to {task}",
-                f"train robots with one of its parts at other tasks than {task} only",
-            )
+            yield found("pair-seen", test.where, task=task)
 
 
-def _extrapolation(test: RuledRobot, train: Sequence[RuledRobot]) -> Iterator[Violation]:
+def _extrapolation(test: RuledRobot, train: Sequence[RuledRobot]) -> Iterator[Finding]:
     if test.category != COMPOSED and test.category in {robot.category for robot in train}:
-        yield (
-            "category-seen",
-            f"category {test.category!r} is in train",
-            "test a category that is not trained",
-        )
+        yield found("category-seen", test.where, category=test.category)
     twin = next((robot.name for robot in train if robot.structure == test.structure), None)
     if twin:
-        yield (
-            "structure-seen",
-            f"train robot {twin} has the same structure, {test.structure}",
-            "test a structure that is not trained",
-        )
-
-
-def _task_violations(test: RuledRobot, train: Sequence[RuledRobot]) -> Iterator[Violation]:
-    if test.task not in {robot.task for robot in train}:
-        yield "task-unseen", f"no train robot learns to {test.task}", "train some robot at it"
+        yield found("structure-seen", test.where, twin=twin, structure=test.structure)
 
 
 def _values(node: Derivation, library: Library) -> dict[str, float]:
