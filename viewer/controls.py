@@ -26,14 +26,8 @@ from morphgen.viewer.robot_uri import WORDS, FileAccess, member_split, parent_fo
 def bind(session: Session, key: str, control: Any, keys: Sequence[str] = ()) -> None:  # noqa: ANN401
     """Keep the value of a control in the page's address; its present value is the default.
 
-    A value of the address that the control cannot have is left out with a note.
-
-    Args:
-        session: Session of the page.
-        key: Key of the value in the address.
-        control: A dropdown, check box, text, number or slider.
-        keys: Texts in the address that stand for the options of a dropdown, by default the options,
-            or for a check box that is on.
+    A value of the address that it cannot have is left out with a note. ``keys`` are the texts of a
+    dropdown's options, by default these, or that of a check box that is on.
     """
     default, keys = control.value, tuple(keys)
 

@@ -39,10 +39,7 @@ def map_svg(
     uris: Sequence[str],
     pictures: Mapping[str, str],
 ) -> str:
-    """Return a map of robots at points (n, 2); a click on a picture opens the robot.
-
-    No robot covers another. Their frame and name show their side.
-    """
+    """Return a map of robots at points (n, 2), which show their side; a click opens one."""
     cells = map_cells(points)
     columns, rows = (cells.max(axis=0) + 1).tolist()
     # Many robots make the pictures smaller, never the map larger.

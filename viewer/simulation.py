@@ -110,10 +110,9 @@ def _read_controller(policy: str, task: str, files: FileAccess) -> ControllerSpe
 
 
 def training_robots(policy: str, files: FileAccess) -> tuple[str, bool, list[tuple[str, str]]]:
-    """Return task, obstacles, and names and URIs of the robots of a checkpoint's training.
+    """Return task, obstacles, names and URIs of the robots of a checkpoint's training.
 
-    It has obstacles if any robot had, because then the policy observes them. There are no robots
-    if they were drawn and their list is missing.
+    There are no robots if they were drawn and their list is missing.
     """
     path = checkpoint_path(policy, BASELINES, files)
     source = read_checkpoint(path)[0].source
@@ -224,10 +223,7 @@ def _demonstrations(folder: str, files: FileAccess) -> Demonstrations:
 def list_episodes(
     folder: str, files: FileAccess
 ) -> tuple[list[tuple[str, str]], list[tuple[int, str, bool]]]:
-    """Return names and hashes of the robots of demonstrations, and facts of each episode.
-
-    The facts are the number of the robot, the task, and whether it was done.
-    """
+    """Return robots of demonstrations, and of each episode the robot's number, task and success."""
     demos = _demonstrations(folder, files)
     episodes = [(each.robot_index, each.task, each.success) for each in demos.episodes]
     return [*zip(demos.robot_names, demos.robot_hashes, strict=True)], episodes

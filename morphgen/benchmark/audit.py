@@ -93,24 +93,7 @@ class Audit:
 def audit(
     split: Split, library: Library, *, near: NearThresholds = NEAR_THRESHOLDS, jobs: int = 1
 ) -> Audit:
-    """Find leaks between train and test robots, and violations of the regime.
-
-    Errors:
-
-    - ``part-missing``, ``body-broken``: a robot cannot be composed;
-    - ``links-many``: a robot has more links than the split's ``max_links``;
-    - ``body-changed``: a robot is not the one that the split names;
-    - ``body-shared``: a test robot is a train robot of the same task;
-    - ``body-near``: a test robot is a near duplicate of one, see ``NearThresholds``;
-    - ``name-shared``: a train and a test robot with the same name are different;
-    - ``similarity-bound``: a test robot violates the bound that the split was made with;
-    - those of ``regime_findings``;
-    - those of ``hold_out_findings``, if the split says what it holds out.
-
-    ``body-repeated`` (a side has a robot twice at one task) is an error if the split says what it
-    holds out, because such splits are made without repeated robots; else it is a warning. So is
-    ``accepted-unused`` (the split accepts a finding that does not occur).
-    """
+    """Find leaks between train and test robots, and violations of the regime (docs/splits.md)."""
     return audit_survey(survey_split(split, library, jobs=jobs), library, near)
 
 
@@ -303,12 +286,6 @@ def audit_goals(
     """Find goals that leak, and sets that do not match the split's robots.
 
     Every set is sampled anew for comparison, and every goal is tested with its configuration.
-    Errors: ``goals-missing`` (a member has no set, or none can be sampled), ``goals-unknown`` (a
-    set without a member), ``goals-body`` (of another robot), ``goals-seed`` and ``goals-config``
-    (made with another seed or other constants than those of the split's sets), ``goals-changed``
-    (differs from the set sampled anew), ``goals-unproven`` (out of reach or in collision),
-    ``goals-shared`` (by train and test, see the module). Warning: ``goals-repeated`` (within a
-    set).
     """
     members = sided_members(split)
     examined = list(parallel_map(partial(_examine, library, goals), members, jobs))
@@ -320,10 +297,7 @@ def audit_goals(
 
 
 def with_goal_findings(audit: Audit, split: Split, findings: Sequence[Finding] | None) -> Audit:
-    """Return an audit with findings about goals added, those that the split accepts as accepted.
-
-    A task that is unknown here is found, too: error ``task-unknown``.
-    """
+    """Return an audit with findings about goals and unknown tasks, accepted ones set apart."""
     known = [finding for finding in audit.findings if finding.code != "accepted-unused"]
     known += [finding for finding, _ in audit.accepted]
     for side, member in sided_members(split):

@@ -616,13 +616,7 @@ def hold_out_rules(split: Split, library: Library) -> tuple[HoldOutRule, ...]:
 
 
 def hold_out_findings(split: Split, library: Library) -> Iterator[Finding]:
-    """Yield the violations of what a split says is held out; all are errors.
-
-    - ``held-out-trained``: a train robot has what is held out;
-    - ``held-out-absent``: a test robot does not have it;
-    - ``held-out-untested``: a rule holds for no test robot;
-    - ``part-unseen``: a part of a test robot is not held out as such, but no train robot has it.
-    """
+    """Yield the violations of what a split says is held out."""
     rules = hold_out_rules(split, library)
     train, test = (
         [(m, parse_derivation(m.derivation, f"derivation of {m.name!r}")) for m in members]

@@ -160,10 +160,9 @@ def parameters(derivation: Derivation, library: Library) -> dict[str, float]:
 def hull_distance(point: ArrayLike, points: ArrayLike) -> float:
     """Return the distance of a point (d,) from the convex hull of others (n, d); 0 inside.
 
-    The distance is the smallest L1 distance to a point of the hull, each coordinate divided by its
-    range over the other points. It is the solution of a linear program, exact to ``ON_HULL``. A
-    coordinate in which the other points are equal is omitted, but a point that differs in it is
-    infinitely far away.
+    It is the smallest L1 distance, each coordinate divided by its range over the others, by a
+    linear program, exact to ``ON_HULL``. A point that differs where all others are equal is
+    infinitely far.
     """
     x, others = np.asarray(point, dtype=np.float64), np.asarray(points, dtype=np.float64)
     low, span = others.min(axis=0), np.ptp(others, axis=0)
@@ -186,15 +185,9 @@ def hull_distance(point: ArrayLike, points: ArrayLike) -> float:
 
 
 def regime_findings(split: Split, library: Library) -> tuple[Finding, ...]:
-    """Return the violations of a split's regime that the derivations of its robots show.
+    """Return the violations of a split's regime that the derivations show; see docs/splits.md.
 
-    - Interpolation: each test robot has the structure of a train robot. If the split was made with
-      a hull, its parameters are inside, or outside, the hull of the train robots of its structure.
-    - Composition: all parts of a test robot are in train robots, but no train robot has its
-      combination. In a split of several tasks, one of its parts is in no train robot of its task.
-    - Extrapolation: no train robot has its grammar or its structure.
-    - Hold-out: see ``morphgen.benchmark.hold_out``, which tests all robots of a split.
-    - All regimes: a train robot has its task.
+    What is held out is tested by ``hold_out_findings``, on all robots of a split.
     """
     train = [RuledRobot.of(member, library) for member in split.train]
     test = [RuledRobot.of(member, library) for member in split.test]

@@ -598,11 +598,10 @@ class Verification:
 
 
 def verify(name_or_path: str | Path, library: Library, *, jobs: int = 1) -> Verification:
-    """Compare a split with the robots that its derivations give today.
+    """Compare a split with the robots that its derivations give today, by its id and their hashes.
 
-    The id of the split and the hash of each robot are tested. In a split folder every file is
-    compared with ``SHA256SUMS`` and with the robot that its derivation gives, too; in a release
-    also its description, its licences and its difficulty.
+    In a folder every file is compared with ``SHA256SUMS`` and with the robot of its derivation; in
+    a release also its description, its licences and its difficulty.
     """
     folder = Path(name_or_path)
     if is_archive(folder):

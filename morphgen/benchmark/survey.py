@@ -217,14 +217,7 @@ def statistics(split: Split, library: Library, *, jobs: int = 1) -> dict[str, ob
 
 
 def summarize_survey(survey: SplitSurvey) -> dict[str, object]:
-    """Compute the statistics of a surveyed split.
-
-    For ``train`` and ``test``: the number of ``robots`` and of distinct ``bodies``; the means of
-    ``links``, ``movable`` joints (mimic joints included) and movable joints between root and tool
-    (``movable_to_tool``); mean, minimum and maximum of ``mass`` [kg] and ``reach`` [m]. A robot
-    with two tasks counts twice. For ``cosine``: mean, minimum and maximum of the cosine similarity
-    over all pairs of a test and a train robot.
-    """
+    """Return the statistics of a surveyed split; ``morphgen.api.splits.statistics`` says which."""
     return {
         **{side: _side(survey, side) for side in SIDES},
         COSINE: mean_and_range(survey.by_measure(COSINE).ravel().tolist()),

@@ -125,14 +125,10 @@ class ConformanceReport:
 
 
 def conformance(bundle_dir: Path, samples: int = 100, seed: int = 0) -> ConformanceReport:
-    """Load a bundle in every loader and compare joints, total mass and tool pose.
+    """Load a bundle in every loader, and compare joints, mass and tool pose; see docs/checks.md.
 
-    The values of joints are compared as far as a loader reads them: position, effort and velocity
-    limits, couplings of mimic joints, damping and friction, and the gains of the MJCF's actuators.
-
-    The loaders are yourdfpy, PyBullet, MuJoCo (URDF and MJCF) and Pinocchio. They are compared with
-    ``morphgen.model.kinematics``. Mimic joints are set like any other joint, except in yourdfpy,
-    which moves them itself. A robot without a frame ``tool`` is compared at its last link.
+    Mimic joints are set like any other joint, except in yourdfpy, which moves them itself. A robot
+    without a frame ``tool`` is compared at its last link.
     """
     robot = read_bundle(bundle_dir)
     with loader_copy(bundle_dir) as folder:
@@ -284,12 +280,9 @@ def _compared(
 
 
 def _compare_joints(robot: Robot, reading: Reading) -> dict[str, list[str] | None]:
-    """Compare the joints of a robot with a loader's; joints that only one has are left out.
+    """Return the differences of a loader's joints in every column that it reads; None if none.
 
-    A chain of mimic joints counts as its product.
-
-    Returns:
-        The differences of every column of joints; None if the loader reads no such values.
+    Joints that only one has are left out. A chain of mimic joints counts as its product.
     """
     movable = [robot.joints[k].name for k in robot.movable_joints]
     shared = [name for name in movable if name in reading.joints]

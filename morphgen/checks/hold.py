@@ -167,10 +167,8 @@ def hold_row(
 ) -> HoldRow:
     """Return the row of a simulator: drift at home for ``HOLD_S``, then a step of each joint.
 
-    The joints step one after the other, each from home, away from their nearer limit. A robot that
-    does not hold its home makes no steps.
-
-    contact_margin: Distance at which links push each other away [m]; None if they never do.
+    Each starts from home, away from the nearer limit; a robot that does not hold its home makes
+    none. Links nearer than ``contact_margin`` [m] push each other away; None if they never do.
     """
     if find_spec(module) is None:
         return HoldRow(name, None, message="not installed")

@@ -409,12 +409,10 @@ def _mujoco_mimics(model: mujoco.MjModel) -> Iterator[tuple[str, Mimic]]:
 
 
 def read_usd(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
-    """Convert the URDF to USD, open the stage and move its physics joints.
+    """Convert the URDF to USD and follow its physics joints from the root link to the frame.
 
-    The joints of ``UsdPhysics`` are followed from the root link to the frame, with the local poses
-    that they have on their two bodies: the nested transforms of the prims are only the pose in
-    which all joints are at zero. Of the joints only the position limits are read: ``UsdPhysics``
-    has no others.
+    They have poses on both bodies; the prims only have the pose in which all joints are at zero. Of
+    the joints only the position limits are read: ``UsdPhysics`` has no others.
     """
     from pxr import Usd, UsdPhysics
 

@@ -38,15 +38,10 @@ class CollisionMatrix:
 def collision_matrix(
     robot: Robot, *, samples: int = MATRIX_SAMPLES, seed: int = 0
 ) -> CollisionMatrix:
-    """Find the pairs of links whose collisions need no test.
+    """Find the pairs of links whose collisions need no test, with the reasons of docs/bundle.md.
 
-    A pair is ``Adjacent`` if a joint links it, also across links without collision shapes;
-    ``Default`` if it collides at home; ``Always`` if it collides in at least ``ALWAYS_SHARE`` of
-    the sampled configurations; ``Never`` if it collides in none of them; and ``User`` if it is in
-    ``robot.ignore_pairs`` for another reason. All other pairs need a test.
-
-    As in all collision checks, meshes count as their convex hulls. Hulls contain their meshes, so
-    that a pair whose hulls never collide is safe for planners that test the meshes, too.
+    As in all collision checks, meshes count as their convex hulls. These contain their meshes, so a
+    pair that never collides is safe for planners that test the meshes, too.
     """
     loose, columns = _with_loose_joints(robot)
     collidable = [link.name for link in robot.links if link.collisions]
@@ -77,9 +72,7 @@ def collision_matrix(
 def _with_loose_joints(robot: Robot) -> tuple[Robot, list[int]]:
     """Replace fixed joints by slides, because MuJoCo never tests links on fixed joints.
 
-    Returns:
-        The robot with slides, which stay at zero, and the columns of its ``q`` that hold the
-        independent joints of the original.
+    Also return the columns of its ``q`` that hold the independent joints; the slides stay at zero.
     """
     joints = tuple(
         joint if joint.is_movable else replace(joint, kind="prismatic", axis=(1, 0, 0), mimic=None)
@@ -99,11 +92,9 @@ def robot_srdf_text(
 ) -> str:
     """Return the SRDF of a robot as text, with the evidence of its disabled pairs as a comment.
 
-    Its names are those of the URDF that morphgen writes. Every tool has a group ``arm``: the chain
-    from the root to the tool. It has a group ``ee`` if the robot has an end-effector there: the
-    links of its part, or in a robot that was not composed of parts, the links around the joints
-    that do not move the tool, such as those of a gripper. The groups of a robot with several limbs
-    are named after them, such as ``left_arm``.
+    Every tool has a group ``arm``, the chain from the root, and ``ee`` if it has an end-effector:
+    the links of its part, or those around the joints that do not move the tool. The groups of a
+    robot with several limbs are named after them, such as ``left_arm``.
     """
     require_tool(robot)
     matrix = collision_matrix(robot, samples=samples, seed=seed)

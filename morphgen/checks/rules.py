@@ -426,9 +426,8 @@ _ROUNDING = 1e-9  # upper bound of the rounding error of a distance [m]
 def check_links_apart(robot: Robot) -> Iterator[Finding]:
     """Find links that no visible shape connects to their parent at home.
 
-    A link without visual shapes is skipped: its children are compared with the nearest ancestor
-    that has some. Where one solid is inside the other, there is no gap. Unreadable shapes are left
-    out, and a robot without valid joint axes and positions is not tested.
+    Children of a link without visual shapes are compared with the nearest ancestor that has some.
+    Where one solid is inside the other, there is no gap.
     """
     if not _has_home_pose(robot):
         return
@@ -460,9 +459,8 @@ def check_self_collision(robot: Robot) -> Iterator[Finding]:
 def home_penetrations(robot: Robot, margin: float = 0.0) -> dict[Pair, float]:
     """Return the pairs of links that penetrate each other at home, with their depth [m].
 
-    Links that are nearer than ``margin`` [m] count, too, with a negative depth. Adjacent links,
-    ``robot.ignore_pairs`` and unreadable shapes are left out. A robot without valid joint axes and
-    positions is not tested.
+    Links nearer than ``margin`` [m] count, with a negative depth. Unreadable shapes are left out,
+    and a robot without valid joint axes and positions is not tested.
     """
     if not _has_home_pose(robot):
         return {}

@@ -33,14 +33,12 @@ the last bit would decide."""
 def robot_hash(robot: Robot, *, visuals: bool = True) -> str:
     """Return a hash of the physical robot: 32 hexadecimal digits of a SHA-256.
 
-    The hash covers links, joints, the home configuration and the tool frame: poses, inertias,
-    shapes, limits, efforts and velocities. A mesh is represented by the content of its file, its
-    scale and its part. Names, colours, ignored pairs and provenance are not covered, so the same
-    robot under other names has the same hash. Numbers have a resolution of 1e-7 (m, rad, kg ...),
-    because their last bits differ between machines.
+    A mesh counts as the content of its file, its scale and its part. Names, colours, ignored pairs
+    and provenance are not covered. Numbers have a resolution of 1e-7 (m, rad, kg ...), because
+    their last bits differ between machines.
 
-    visuals: Include visual shapes. Without them, and with primitives as collision shapes, the
-        hash does not depend on how meshes are stored.
+    visuals: Include visual shapes. Without them, and with primitives as collision shapes, the hash
+    does not depend on how meshes are stored.
     """
     tool = next((frame for frame in robot.frames if frame.name == TOOL), None)
     tool_frame = None if tool is None else [robot.link_index[tool.link], _pose(tool.T_link_frame)]

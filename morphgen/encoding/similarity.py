@@ -48,12 +48,10 @@ class Workspace:
 
 
 def workspace(robot: Robot) -> Workspace:
-    """Sample the tool positions of a robot.
+    """Sample the tool positions of a robot, uniformly within the limits of the joints that move it.
 
-    Configurations are drawn uniformly within the limits of the joints that move the tool. The seed
-    is fixed and joints are drawn from the base on, so that one arm with different grippers gets the
-    same arm configurations. Each sample is distributed over the eight nodes around it by trilinear
-    weights.
+    The seed is fixed and joints are drawn from the base on, so that one arm with different grippers
+    gets the same configurations. Each sample is distributed over the eight nodes around it.
     """
     points, centre, farthest = _tool_points(robot)
     return Workspace(_density(points / farthest), centre, farthest)
@@ -92,12 +90,9 @@ def density_overlap(a: Workspace, b: Workspace) -> float:
 def shoulder(robot: Robot) -> Vec3:
     """Return the point of a robot around which its tool moves, in the root frame [m].
 
-    The root's origin would not do, because a pedestal or a rail would shift the workspace against
-    that of the same arm on the floor; nor the origin of the first joint, which may be anywhere on
-    its axis. The shoulder is the point on the first rotational axis between root and tool that is
-    nearest to the next axis not parallel to it, as in the Denavit-Hartenberg convention. If all
-    axes are parallel, it is the point nearest to the tool; without rotational joints, the tool
-    itself. Joints are in the middle of their range, which matters for prismatic joints only.
+    It is the point on the first rotational axis between root and tool that is nearest to the next
+    axis not parallel to it (Denavit-Hartenberg). If all are parallel, it is the point nearest to
+    the tool; without any, the tool. Joints are in the middle of their range.
     """
     chain = _tool_chain(robot)
     T_root_link = forward_kinematics(robot, joint_limits(robot).mean(axis=1))
@@ -216,14 +211,11 @@ class LabelledTree:
 
 
 def labelled_tree(robot: Robot, shapes: Mapping[str, Shape], reach: float) -> LabelledTree:
-    """Convert a robot to a tree for ``normalised_distance``.
+    """Convert a robot with its token shapes to a tree; lengths are divided by its reach [m].
 
     Links without a shape on fixed joints count as frames: their children are attached to their
-    parent. The order of children does not depend on the file: subtrees are sorted by their cost,
-    descending, and then by the labels of their nodes.
-
-    shapes: One primitive per link with geometry, by link name.
-    reach: Length by which all lengths are divided [m].
+    parent. Subtrees are sorted by cost, descending, then by labels, whatever their order in the
+    file.
     """
     nodes, parents = [_Node(_GROUND)], [-1]
     T_root_link = forward_kinematics(robot, robot.home)
@@ -321,15 +313,10 @@ def _in_postorder(nodes: list[_Node], parents: list[int]) -> LabelledTree:
 def normalised_distance(a: LabelledTree, b: LabelledTree) -> float:
     """Return the normalised edit distance of two trees, in [0, 1]; 0 for equal trees.
 
-    With the edit distance d and the costs |a| and |b| to insert a whole tree, it is
-    2 d / (|a| + |b| + d): Li and Chenguang, A metric normalization of tree edit distance, 2011.
-    1 means that no part of one tree can be kept for the other.
-
-    It is a metric of trees. Li and Chenguang prove the triangle inequality for equal costs of all
-    insertions, which differ here. But the formula is the Steinhaus transform of the metric d with
-    respect to the empty tree, at the distances |a| and |b|, which is a metric for every metric d
-    (Deza and Deza, Encyclopedia of Distances, chapter 4). Properties that are not compared, such as
-    joint limits, do not change the tree.
+    With the edit distance d and the costs |a| and |b| to insert a tree, it is 2 d / (|a| + |b| +
+    d): Li and Chenguang, A metric normalization of tree edit distance, 2011. It is the Steinhaus
+    transform of d with respect to the empty tree, and so a metric (Deza and Deza, Encyclopedia of
+    Distances, chapter 4) also where the costs of insertions differ.
     """
     distance = edit_distance(a, b)
     total = math.fsum(a.weights) + math.fsum(b.weights) + distance
@@ -523,14 +510,11 @@ class MdsMap:
 
 
 def classical_mds(distances: ArrayLike) -> MdsMap:
-    """Embed distances in the plane by classical multidimensional scaling (Torgerson, 1952).
+    """Embed distances (n, n) in the plane by classical multidimensional scaling (Torgerson, 1952).
 
-    The axes are the two largest eigenvectors of the doubly centred squared distances. ``shares``
-    are their parts of the sum of all eigenvalues' magnitudes (Mardia, Kent and Bibby, Multivariate
-    analysis, 1979, section 14.4), because non-Euclidean distances give negative eigenvalues. The
-    sign of each axis is chosen so that the farthest point, or the first of several, is positive.
-
-    distances: Symmetric distances with a zero diagonal, shape (n, n).
+    ``shares`` are parts of the sum of all eigenvalues' magnitudes (Mardia, Kent and Bibby,
+    Multivariate analysis, 1979, section 14.4), because non-Euclidean distances give negative ones.
+    The sign of each axis is such that the farthest point is positive.
     """
     d = np.asarray(distances, dtype=np.float64)
     if d.ndim != 2 or d.shape[0] != d.shape[1] or not len(d):

@@ -120,12 +120,7 @@ def pad_tokens(tokens: Array, max_links: int) -> tuple[Array, NDArray[np.bool_]]
 
 
 def tokens_npz(tokens: Array, links: Sequence[str], name: str, max_links: int = MAX_LINKS) -> bytes:
-    """Return an npz file of a robot's tokens and their description.
-
-    Arrays: ``tokens`` (..., n_links, 48), names of the ``links`` (n_links,), names of the fields
-    in ``layout`` (9,), first and end index of each field in ``columns`` (9, 2), ``name`` and
-    ``max_links``.
-    """
+    """Return an npz file of a robot's tokens and their description; see docs/tokens.md."""
     content = io.BytesIO()
     np.savez(
         content,
@@ -279,9 +274,8 @@ def robot_from_tokens(
     """Decode tokens (n_links, 48) and return the robot and its primitives by link name.
 
     Links are named ``link0``, ``link1`` ..., and joints ``joint1`` ... after their child links.
-    The primitives become collision shapes. Movable joints are independent and have limits (-1, 1),
-    so that q is the normalized position. The home is the configuration of the tokens, and the tool
-    frame is its link's frame. ``docs/tokens.md`` lists what tokens do not contain.
+    Movable joints have limits (-1, 1), so that q is the normalized position; the home is that of
+    the tokens.
     """
     table = np.asarray(tokens, dtype=np.float64)
     what = f"tokens of {name!r}"

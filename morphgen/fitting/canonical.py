@@ -53,10 +53,8 @@ def canonical(shape: Shape) -> Shape:
 def least_rotation(kind: Kind, R: Array) -> Quat:
     """Return the rotation of the smallest angle among those that leave a primitive the same.
 
-    A sphere has the identity. A cylinder has the rotation that takes z to its axis, where the axis
-    points above the xy plane. A box has the one of its 24 rotations nearest to the link's axes.
-
-    R: Any of the rotations, shape (3, 3).
+    A cylinder's takes z to its axis, pointing above the xy plane; a box's is that of its 24
+    rotations nearest to the link's axes.
     """
     if kind == "sphere":
         return IDENTITY

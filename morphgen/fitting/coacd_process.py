@@ -14,11 +14,7 @@ import numpy as np
 
 
 def main(mesh_file: str, pieces_file: str, settings: str) -> None:
-    """Decompose a mesh.
-
-    mesh_file: npz file with ``vertices`` (n, 3) and ``faces`` (m, 3).
-    pieces_file: npz file to write, with the vertices (k, 3) of each piece under its number.
-    """
+    """Decompose a mesh from an npz file (``vertices``, ``faces``) to one with numbered pieces."""
     coacd.set_log_level("error")
     with np.load(mesh_file, allow_pickle=False) as arrays:
         mesh = coacd.Mesh(arrays["vertices"], arrays["faces"])

@@ -56,12 +56,10 @@ _MAX_GROWTHS = 20
 
 
 def enclose(points: Array, kinds: Collection[Kind] = KINDS) -> Shape:
-    """Return the box, cylinder or sphere of least volume that contains all points.
+    """Return the box, cylinder or sphere of least volume that contains all points (n, 3) [m].
 
-    The pose is rounded (1 um, 9 decimals of the quaternion) before the dimensions are measured and
-    rounded up to 1 um, so no point is more than 1e-9 m outside.
-
-    points: Points in the link frame [m], shape (n, 3).
+    The pose is rounded before the dimensions are measured and rounded up to 1 um, so no point is
+    more than 1e-9 m outside.
     """
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points have the shape {points.shape}; expected (n, 3)")
@@ -230,11 +228,10 @@ def _balls_through(pivot: Array, support: Array) -> Iterator[tuple[float, Array,
 def enclose_solid(
     target: SampledSolid, max_primitives: int, iou: float, seed: int
 ) -> tuple[Shape, ...]:
-    """Return primitives that contain a solid with little excess volume.
+    """Return the fewest primitives that contain a solid with at least ``iou``, or the best.
 
-    One primitive is the one of least volume. For several, the solid is cut along the bisecting
-    planes between cluster centres, and each piece is enclosed; the best of ``NUM_CLUSTERINGS``
-    partitions is kept. The number of primitives is the smallest that reaches ``iou``, or the best.
+    For several, the solid is cut along the bisecting planes between cluster centres, and each piece
+    is enclosed; the best of ``NUM_CLUSTERINGS`` partitions is kept.
     """
     best: tuple[Shape, ...] = (enclose(np.asarray(target.solid.mesh.vertices)),)
     best_iou = _iou(best, target)

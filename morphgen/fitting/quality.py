@@ -52,13 +52,10 @@ def quality(
     volume_points: int = 32768,
     surface_points: int = 8192,
 ) -> Quality:
-    """Measure how well primitives approximate a solid.
+    """Measure how well primitives, at least one, approximate a solid in the link frame.
 
     The surface of a solid with holes consists of the triangles that exist. Triangles inside of the
     solid count only for distances from points inside of it.
-
-    solid: The solid in the link frame.
-    primitives: Boxes, cylinders, spheres and capsules in the link frame, at least one.
     """
     vertices = np.asarray(solid.mesh.vertices)[solid.mesh.referenced_vertices]
     at_vertices = signed_distance(primitives, vertices)

@@ -73,10 +73,8 @@ def with_geometry(robot: Robot, geometry: str, folders: Sequence[Path]) -> Robot
 def as_primitives(robot: Robot, folders: Sequence[Path]) -> Robot:
     """Return the robot as tasks use it: fitted collision primitives, numbers rounded as in a file.
 
-    Fits that the robot carries or that the folders store are used. Other links with meshes are
-    fitted once, which is logged, and their fits are cached. The result carries the token primitive
-    of each link. A robot, its bundle (with meshes or primitives) and the result of this function
-    all give the same result.
+    Fits that the robot carries or that the folders store are used; other meshes are fitted once,
+    which is logged and cached. A robot, its bundle and the result of this function give the same.
     """
     fits = _known_fits(robot, read_stored_fits(folders))
     if missing := _meshed_links(robot, fits):
@@ -96,12 +94,9 @@ def as_spheres(
     cover: float | None = None,
     jobs: int = 1,
 ) -> Robot:
-    """Return the robot with spheres as its collision shapes.
+    """Return the robot with spheres as its collision shapes, from the user's cache or a new fit.
 
-    A link whose collision shapes are spheres already keeps them. The spheres of the others come
-    from the user's cache or from a new fit, which is then cached.
-    Masses, inertias and visuals stay; the pairs of links whose contacts are ignored are determined
-    again.
+    A link of spheres keeps them. The pairs whose contacts are ignored are determined again.
     """
     from morphgen.fitting.link_fit import FitOptions  # needs the extra fit
 
@@ -218,12 +213,10 @@ def with_fits(robot: Robot, fits: Mapping[str, StoredFit]) -> Robot:
 def with_primitives(
     robot: Robot, primitives: Mapping[str, Sequence[Shape]], *, visual: bool = False
 ) -> Robot:
-    """Return the robot with other collision primitives, numbers rounded as in a file.
+    """Return the robot with other collision primitives by link, numbers rounded as in a file.
 
-    Masses and inertias stay. The pairs of links whose contacts are ignored are determined again.
-
-    primitives: Collision primitives by link name. A link without an entry keeps its collision
-        shapes if they are primitives, and loses them if they are meshes.
+    The pairs whose contacts are ignored are determined again. A link without an entry keeps its
+    collision shapes if they are primitives, and loses them if they are meshes.
     """
     links = tuple(_with_collision(link, primitives.get(link.name), visual) for link in robot.links)
     fitted = as_written(replace(robot, links=links, ignore_pairs=()))
@@ -291,10 +284,9 @@ _PIECE = "piece-{:02d}.stl"
 def as_convex(robot: Robot, folders: Sequence[Path] = ()) -> Robot:
     """Return the robot with convex pieces in place of its collision meshes.
 
-    Pieces are kept in the user's cache under the content of the mesh file, so a mesh is decomposed
-    once, in seconds to minutes. A mesh that is convex stays as it is, and so do primitives: the
-    result of this function, and its bundle, give themselves. Masses, inertias and fits of
-    primitives stay. The pairs of links whose contacts are ignored are determined again.
+    Pieces are kept in the user's cache, so a mesh is decomposed once, in seconds to minutes. A
+    convex mesh stays, and so do primitives: the result of this function, and its bundle, give
+    themselves. The pairs whose contacts are ignored are determined again.
     """
     meshed = [link for link in robot.links if has_meshes(link.collisions)]
     shapes = [shape for link in meshed for shape in link.collisions]

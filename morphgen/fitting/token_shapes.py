@@ -325,19 +325,10 @@ the union, so this is also their intersection over union."""
 def token_shapes(robot: Robot, folders: Sequence[Path] = ()) -> dict[str, Shape]:
     """Return the box, cylinder or sphere that overlaps the collision shapes of each link most.
 
-    A token describes collision geometry: a link with visuals only, such as a rail or a mast, has
-    no primitive. The primitive of a link comes from the first source that has one:
-
-    1. the fits that the robot carries, then those stored in the folders;
-    2. a primitive of the link that has most of its volume (``DOMINANT_SHARE``), in its canonical
-       pose;
-    3. the user's cache;
-    4. a new fit, which is then cached. A fit to primitives is the same on
-       every machine (``composite``). A fit to meshes depends on the last bits of floating-point
-       numbers, so it may differ between machines.
-
-    Returns:
-        Primitives by link name, without links that have no collision shapes or no volume.
+    It comes from the first source that has one: the fits that the robot carries or the folders
+    store; a primitive of the link that has most of its volume (``DOMINANT_SHARE``); the user's
+    cache; a new fit, which is then cached. A fit to meshes depends on the last bits of numbers, so
+    it may differ between machines. Links without collision shapes or volume have none.
     """
     stored = fits.read_stored_fits(folders)
     primitives: dict[str, Shape | None] = {}

@@ -91,11 +91,7 @@ def write_bundle(
     picture: bool = True,
     edits_kept: bool = True,
 ) -> Path:
-    """Write a robot's bundle atomically.
-
-    Returns:
-        ``folder``.
-    """
+    """Write a robot's bundle atomically; return ``folder``."""
     if edits_kept:
         require_replaceable(folder)
     robot = split_colours(robot)
@@ -176,8 +172,6 @@ def read_robot(path: Path, *, root: Path | None = None, skip_missing_meshes: boo
 
     The URDF or MJCF of a bundle stands for the bundle. Another description gets the fits of a
     ``primitives.json`` beside it, such as that of an exported URDF.
-
-    skip_missing_meshes: Whether shapes of a URDF whose mesh is not found are left out.
     """
     if path.is_dir():
         return read_bundle(path, root=root)
@@ -220,9 +214,7 @@ def _split_shape(shape: Shape) -> tuple[Shape, ...]:
 def write_meshes(robot: Robot, folder: Path) -> dict[Mesh, str]:
     """Write every mesh of a robot once, in metres, as STL or, if it is large, as OBJ.
 
-    Returns:
-        The file of every mesh, such as ``meshes/hand-1a2b3c4d.stl``: relative to the parent of
-        ``folder``.
+    Return their files, such as ``meshes/hand-1a2b3c4d.stl``: relative to the parent of ``folder``.
     """
     files: dict[Mesh, str] = {}
     for link in robot.links:

@@ -25,10 +25,7 @@ _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def read_bytes(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
-    """Return the content of a regular file.
-
-    max_bytes: Largest file to read [bytes].
-    """
+    """Return the content of a regular file of at most ``max_bytes``."""
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):  # a pipe may never end

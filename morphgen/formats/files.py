@@ -35,11 +35,8 @@ def require_unedited(
 ) -> None:
     """Require that a folder, such as a bundle, holds no work of the user.
 
-    Links are followed; one that leads to no file counts as changed or added. Missing files and
-    ``SYSTEM_FILES`` do not count.
-
-    generated: Files that may differ from their hashes.
-    choice: What the user can choose instead, for the error.
+    Missing files and ``SYSTEM_FILES`` do not count. ``generated`` may differ from their hashes;
+    ``choice`` is what the user can choose instead, for the error.
     """
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -116,14 +113,10 @@ def begin_folder(
     *,
     first: Mapping[str, str] | None = None,
 ) -> None:
-    """Begin a folder by writing the settings that it is made with, or require the same in it.
+    """Begin a folder with a JSON file of its settings, or require the same in it.
 
     So an interrupted run is only continued with equal settings. Traces of one that was killed at
-    its start do not count.
-
-    path: File of the settings in the folder, which is JSON.
-    kind: What the folder holds, for errors.
-    first: Texts of files that are written before, by name.
+    its start do not count. ``kind`` is for errors, ``first`` are texts of files written before.
     """
     folder, text = path.parent, json.dumps(settings, indent=2) + "\n"
     texts = {**(first or {}), path.name: text}
@@ -231,10 +224,9 @@ MANIFEST = "export.json"  # file that lists the other files of an exported folde
 
 @contextmanager
 def writing_export(folder: Path, format_name: str, robot_name: str) -> Iterator[Path]:
-    """Yield a temporary folder that replaces ``folder`` if the block succeeds.
+    """Yield a temporary folder that replaces ``folder``, with a manifest, if the block succeeds.
 
-    The manifest is added at the end. A folder that holds anything else than an unchanged export is
-    never replaced, because it may contain work of the user.
+    A folder with anything else than an unchanged export may have work of the user and stays.
     """
     _require_replaceable(folder, robot_name)
     with replacing_folder(folder) as partial:

@@ -42,12 +42,10 @@ _FILE_ATTRIBUTES = ("assetdir", "meshdir", "strippath", "texturedir")
 
 @contextmanager
 def loader_copy(path: Path, finder: PackageFinder | None = None) -> Iterator[Path]:
-    """Yield a private folder with a copy of a robot that other libraries may open.
+    """Yield a temporary folder with a copy of a robot that other libraries may open.
 
-    Yields:
-        The folder, which is removed afterwards. It holds ``robot.urdf`` of a bundle, a URDF or a
-        xacro, ``robot.xml`` of a bundle or an MJCF, and beside them their meshes as STL or OBJ.
-        Elements that a robot does not need are left out.
+    It has ``robot.urdf`` and ``robot.xml`` of a bundle, or what was read, with meshes as STL or OBJ
+    beside them, without elements that a robot does not need.
     """
     finder = finder or default_finder()
     with TemporaryDirectory(prefix="morphgen-") as name:

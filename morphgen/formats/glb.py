@@ -31,8 +31,7 @@ _MAX_SMOOTHED_FACES = 150_000
 def glb_bytes(robot: Robot) -> bytes:
     """Return a robot at home as binary glTF; the same robot gives the same bytes.
 
-    Every link is a node of its name below the node of its parent link, frames are nodes, too, and
-    visual shapes are nodes ``LINK_visual_0`` and so on with their colour as base colour. A node
+    Links and frames are nodes of their names, visual shapes are ``LINK_visual_0`` and so on. A node
     whose name is taken gets a number.
     """
     if not any(link.visuals for link in robot.links):

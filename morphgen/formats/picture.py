@@ -41,11 +41,7 @@ class GlContext(Protocol):
 def render(
     robot: Robot, mjcf: Path, q: ArrayLike | None = None, size: tuple[int, int] = SIZE
 ) -> Image.Image:
-    """Draw a robot from its MJCF with MuJoCo's renderer.
-
-    q: Configuration, shape (dof,); home by default.
-    size: Width and height [px].
-    """
+    """Draw a robot at q (dof,), by default at home, with MuJoCo's renderer; size in pixels."""
     import mujoco
 
     log_mujoco_warnings()

@@ -49,15 +49,11 @@ class PackageFinder:
     """Whether shapes of a URDF whose mesh is not found are left out, with a finding."""
 
     def find(self, package: str, *files: Path) -> Path:
-        """Return the folder of a package.
+        """Return the folder of a package: around the files, from each upwards, then in the roots.
 
-        The search order is: for each of ``files``, from the file upwards, a folder that is the
-        package (by its ``package.xml`` or its name) or contains it directly, above the file's tree
-        (see ``find_file``) only with a ``package.xml`` or ROS's suffix; in each root, a folder of
-        that name or, up to two levels down, one whose ``package.xml`` has that name. Descriptions
-        are often copied into a folder without ROS's suffix, so ``x_description`` and ``x_support``
-        are then searched as ``x``. Names are case-sensitive, and the root of the file system is not
-        searched.
+        Above a file's tree a folder needs a ``package.xml`` or ROS's suffix. Descriptions are often
+        copied into a folder without that, so ``x_description`` and ``x_support`` are then searched
+        as ``x``.
         """
         prefix = f"{files[0]}: " if files else ""
         if not _PACKAGE_NAME.match(package):
@@ -145,22 +141,16 @@ def resolve_uri(uri: str, base_file: Path, finder: PackageFinder) -> Path:
 
 
 def find_file(uri: str, base_file: Path, finder: PackageFinder) -> FoundFile:
-    """Return the file that a URI inside a robot description refers to.
+    """Return the file that a URI inside a robot description refers to; see docs/importing.md.
 
-    Supported are ``package://`` and ``model://`` (looked up by the finder), ``file://``, absolute
-    and relative paths (from the description's folder, then from the finder's ``root``). A name is
-    tried as written, then with its ``%`` escapes decoded; backslashes count as slashes; letter case
-    matters. The first package that has the file counts. If none around the description has it, it
-    is also searched without the package's name: in the folders of the description's tree, nearest
-    first, and in the finder's ``root``, there also by the last parts of its path.
+    A name is tried as written, then with its ``%`` escapes decoded; backslashes count as slashes;
+    letter case matters. If no package has the file, it is also searched without the package's name:
+    in the folders of the description's tree, nearest first, and in the finder's ``root``, there
+    also by the last parts of its path.
 
-    Security: a description may only refer to files of ROS packages and of its own tree, because a
-    stranger's file could otherwise copy private files into a bundle. The tree is the nearest folder
-    above it with a ``package.xml``, else the nearest named ``*_description`` or ``*_support``, else
-    the folder above its own (so that ``urdf/robot.urdf`` reaches ``meshes/``). A relative path that
-    leaves the tree is refused unless it leads into the finder's ``root``. An absolute path outside
-    the tree, the finder's folders and all ROS packages is refused, too; name its folder as the root
-    to allow it. The targets of symbolic links must meet the same rules.
+    Security: only files of ROS packages, the finder's folders and the description's own tree are
+    allowed, symbolic links resolved, because a stranger's file could otherwise copy private files
+    into a bundle.
     """
     base = _absolute(base_file)
     text = uri.strip().replace("\\", "/")
@@ -247,13 +237,9 @@ def package_source(file: FoundFile) -> dict[str, str]:
 
 
 def require_allowed_text(path: Path, finder: PackageFinder, *files: Path) -> None:
-    """Require that a xacro may read a text file or list a folder.
+    """Require that a xacro may read a text file or list a folder; see docs/importing.md.
 
-    Security: a xacro can copy text into the robot, so it must not read private files. Allowed is
-    the package (the nearest folder above with a ``package.xml``, else the nearest named
-    ``*_description`` or ``*_support``) of the xacro's files; without one, their own folders, and
-    the folder above one that is named ``urdf`` or similar. Also allowed are folders with a
-    ``package.xml``, the finder's folders and its root. Symbolic links are resolved first.
+    Security: a xacro can copy text into the robot, so it must not read private files.
     """
     real = path.resolve()
     if _is_in(real, (*finder.roots, finder.root)):
@@ -313,9 +299,8 @@ def distribution_file(package: str, relative: str) -> Path:
 def _tree(file: Path, *, for_text: bool = False) -> Path:
     """Return the folder that a description's mesh paths must not leave.
 
-    With ``for_text``, return the folder that a xacro's includes and YAML must not leave. It is the
-    stricter one: text would be copied literally, and the folder above a download may be the user's
-    home.
+    With ``for_text``, it is that of a xacro's includes, a stricter one: text would be copied
+    literally, and the folder above a download may be the user's home.
     """
     file = _absolute(file)
     ancestors = _ancestors(file)

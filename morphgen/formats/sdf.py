@@ -26,13 +26,10 @@ _MASSLESS = Inertial(
 def sdf_text(robot: Robot, mesh_uri: MeshUri) -> str:
     """Write a robot as an SDFormat model; the same robot gives the same bytes.
 
-    The root is fixed to the world, as in the MJCF; an empty root named ``world`` is the world.
     Poses of links are relative to the model, at position zero of all joints, so that readers
-    without frame semantics place them, too. Joints are at the origins of their child links. Named
-    frames become ``<frame>``. Massless links get the bounds of the MJCF (1e-12 kg, 1e-14 kg m^2).
-
-    All names in a model must differ, unlike in a URDF: a joint that is named like a link gets
-    ``_joint`` appended, a frame ``_frame``, as by SDFormat's own converter of URDF.
+    without frame semantics place them, too. All names in a model must differ, unlike in a URDF: a
+    joint that is named like a link gets ``_joint`` appended, a frame ``_frame``, as by SDFormat's
+    own converter.
     """
     has_world_root = robot.root.name == _WORLD and robot.root.is_empty
     links = {link.name for link in robot.links}

@@ -103,11 +103,9 @@ _CUROBO_VERSION = 2.0
 def curobo_text(
     robot: Robot, spheres: Sequence[LinkSpheres], ignored: Iterable[Pair], urdf: str, comment: str
 ) -> str:
-    """Return a robot's configuration for cuRobo as YAML: spheres, pairs to ignore and joints.
+    """Return a robot's configuration for cuRobo (format version 2.0) as YAML.
 
-    The keys are those that cuRobo's ``KinematicsLoaderCfg`` and ``CSpaceParams`` read (format
-    version 2.0, https://github.com/NVlabs/curobo). Keys with values that a robot does not
-    determine, such as limits of acceleration and jerk, are left out: cuRobo takes its defaults.
+    Keys that a robot does not determine, such as limits of acceleration, are left to its defaults.
     """
     require_tool(robot)
     # "tool" of a robot with several limbs is the tool of the last one.

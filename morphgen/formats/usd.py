@@ -16,15 +16,11 @@ if TYPE_CHECKING:
 
 
 def convert_urdf(urdf: Path, folder: Path) -> Path:
-    """Write a robot as USD: an asset whose layers and mesh library lie in ``folder/Payload``.
+    """Write a robot as USD, with layers in ``folder/Payload``; return the file to open.
 
-    Simulators compute what is missing from the collision shapes. Therefore a centre of mass at the
-    origin of its link, which the converter leaves out, is added, and massless bodies get the bounds
-    of the MJCF (1e-12 kg, 1e-14 kg m^2), because USD takes a mass of zero for a missing one. Joints
-    and links get their poses again; see ``_write_poses``.
-
-    Returns:
-        The file to open, named after the robot.
+    Simulators compute what is missing from the collision shapes. So a centre of mass at the origin
+    of its link, which the converter leaves out, is added, and massless bodies get the bounds of the
+    MJCF, because USD takes a mass of zero for a missing one.
     """
     import urdf_usd_converter
     from pxr import Gf, Tf, Usd, UsdPhysics

@@ -38,11 +38,10 @@ _MAX_ERRORS = 100  # number of errors after which libxml2 reports no more
 
 
 def parse_xml(data: bytes, origin: str) -> etree._Element:
-    """Parse a document strictly and return its root element.
+    """Parse a document strictly and return its root element, without comments.
 
-    Document type declarations are refused, because entities are defined there: they could expand
-    without bound ("billion laughs") or include other files. Comments and processing instructions
-    are dropped, so that the text around them is a single string.
+    Document type declarations are refused: entities are defined there, which could expand without
+    bound ("billion laughs") or include other files.
     """
     try:
         root = etree.fromstring(data, _parser())
@@ -67,17 +66,11 @@ def _parser(*, recover: bool = False) -> etree.XMLParser:
 
 
 def parse_description(data: bytes, origin: str) -> tuple[etree._Element, tuple[Finding, ...]]:
-    """Parse a robot description as tolerantly as robot software does.
+    """Parse a robot description as tolerantly as robot software does; return warnings, too.
 
-    A document that is not valid XML is repaired where tinyxml2, which Pinocchio, PyBullet and
-    MuJoCo use, or libxml2's recovery, which yourdfpy uses, read it without a doubt: comments with
-    ``--``, a bare ``&``, ``<`` in an attribute, text before and after the root element, an invalid
-    declaration or encoding, unprintable characters, and prefixes without a namespace. What has two
-    meanings is refused: elements that are not closed, attributes that are repeated or without a
-    value, a ``<`` in a text. A DOCTYPE is always refused, and entities are never expanded.
-
-    Returns:
-        The root element, and a warning for every kind of repair.
+    Repaired is what tinyxml2, which Pinocchio, PyBullet and MuJoCo use, or libxml2's recovery,
+    which yourdfpy uses, read without a doubt. What has two meanings is refused, a DOCTYPE always,
+    and entities are never expanded.
     """
     try:
         return parse_xml(data, origin), ()

@@ -112,10 +112,8 @@ def actuation(robot: Robot) -> tuple[Actuation, ...]:
     """Return the position-control gains of every independent joint, from the inertia at home.
 
     A joint with inertia I is critically damped at the frequency omega = ``BANDWIDTH`` by the
-    stiffness omega^2 I and the damping 2 omega I. I is the joint's diagonal entry of the
-    joint-space inertia, raised by an armature to ``MIN_RELATIVE_INERTIA`` and
-    ``MIN_ROTATIONAL_INERTIA`` or ``MIN_SLIDING_MASS``. The joint and the mimic joints that follow
-    it share the armature; see ``COUPLED_INERTIA``.
+    stiffness omega^2 I and the damping 2 omega I. I is raised by an armature, which mimic joints
+    that follow share; see ``COUPLED_INERTIA``.
     """
     inertias, armatures = _inertias(robot)
     joints = [robot.joints[k] for k in robot.independent_joints]

@@ -41,11 +41,10 @@ _CORNER_SIGNS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 def inertial_from_density(shapes: Sequence[Shape], density: float) -> Inertial:
-    """Return the mass properties of solid shapes with uniform density, overlaps counted once.
+    """Return the mass properties of solid shapes of one density [kg/m^3], overlaps counted once.
 
-    Primitives use closed forms. A closed mesh counts as its volume, an open one as its convex hull.
-    The overlap of shapes is measured on their tessellations by exact booleans. The density is in
-    kg/m^3; without shapes the mass is zero.
+    Primitives use closed forms; an open mesh counts as its convex hull. The overlap of shapes is
+    measured on their tessellations by exact booleans.
     """
     moments = _union_moments(*_cache_key(shapes))
     volume = float(moments[3, 3])

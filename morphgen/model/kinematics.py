@@ -55,16 +55,10 @@ def periodic_joints(robot: Robot) -> NDArray[np.bool_]:
 
 
 def unwrap_joints(robot: Robot, q_reference: ArrayLike, q: ArrayLike) -> Array:
-    """Shift periodic joints by whole turns to their positions nearest to a reference.
+    """Shift periodic joints of q (..., dof) by whole turns to nearest a reference (dof,).
 
-    A joint beyond its limits from where no turn leads within them stays.
-
-    q_reference: Reference configuration, shape (dof,).
-    q: Configurations, shape (..., dof).
-
-    Returns:
-        Configurations that give the same poses of all links, in the shape of ``q``; within the
-        joint limits if those of ``q`` are.
+    All links keep their poses, and joints within their limits stay so; one beyond them stays if no
+    turn leads within.
     """
     q_reference, q = np.asarray(q_reference, dtype=np.float64), np.asarray(q, dtype=np.float64)
     lower, upper = joint_limits(robot).T
@@ -119,15 +113,11 @@ def joint_axes(robot: Robot, T_root_link: Array) -> tuple[Array, Array]:
 
 
 def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = TOOL) -> tuple[Array, Array]:
-    """Return the pose and the geometric Jacobian of a named frame in the root frame.
+    """Return pose (..., 4, 4) and geometric Jacobian (..., 6, dof) of a frame in the root frame.
 
     Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 3.1.3: a revolute
-    joint with axis z and anchor p contributes (z x (p_frame - p), z), a prismatic one (z, 0).
-
-    Returns:
-        ``T_root_frame``, shape (..., 4, 4), and ``J_root_frame``, shape (..., 6, dof): linear
-        velocity of the frame's origin, then angular velocity; mimic joints are folded into their
-        leaders.
+    joint with axis z and anchor p contributes (z x (p_frame - p), z), a prismatic one (z, 0). Rows
+    are linear, then angular velocity; mimic joints are folded into their leaders.
     """
     positions = movable_positions(robot, q)
     movable, T_last_frame = moving_chain(robot, frame)
@@ -175,14 +165,11 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def link_jacobians(robot: Robot, T_root_link: Array) -> Array:
-    """Return the spatial Jacobian of every link in the root frame.
+    """Return the spatial Jacobian of every link in the root frame, (..., n_links, 6, n_movable).
 
-    Spatial: the linear velocity is that of the link's point that coincides with the root's origin
-    (Featherstone, Rigid Body Dynamics Algorithms, 2008, section 2.2).
-
-    Returns:
-        ``J_root_link``, shape (..., n_links, 6, n_movable): linear, then angular velocity per unit
-        velocity of each movable joint; mimic joints have columns of their own.
+    Its linear velocity is that of the link's point that coincides with the root's origin
+    (Featherstone, Rigid Body Dynamics Algorithms, 2008, section 2.2). Mimic joints have columns of
+    their own.
     """
     anchors, axes = joint_axes(robot, T_root_link)
     jacobians = np.zeros((*T_root_link.shape[:-2], 6, len(robot.movable_joints)))
@@ -199,11 +186,9 @@ def link_jacobians(robot: Robot, T_root_link: Array) -> Array:
 
 
 def reach(robot: Robot, frame: str = TOOL, samples: int = 256, rounds: int = 6) -> float:
-    """Return the largest distance between a frame and the root's origin [m].
+    """Return the largest distance between a frame and the root's origin [m], by random search.
 
-    Random search: the best of random configurations are improved by random steps of decreasing
-    size. The seed is fixed, so that the result is a property of the robot. The travel of a
-    prismatic base counts.
+    The seed is fixed, so that it is a property of the robot. The travel of a prismatic base counts.
     """
     rng = np.random.default_rng(0)
     lower, upper = joint_limits(robot).T
@@ -396,15 +381,10 @@ def solve_position_ik(
     max_step: float = MAX_STEP,
     tolerance: float = 0.0,
 ) -> tuple[Array, Array]:
-    """Move tools to positions by damped least squares, within the joint limits.
+    """Move tools from q (n, dof) to positions (n, 3) in the root frame by damped least squares.
 
-    q: Initial configurations, shape (n, dof) [rad or m].
-    positions: Goal positions of the tools in the root frame, shape (n, 3) [m].
-    max_step: Largest change of a joint position in one iteration [rad or m].
-    tolerance: Distance at which a tool has arrived and its row iterates no more [m].
-
-    Returns:
-        Configurations, shape (n, dof), and the remaining position errors, shape (n, 3) [m].
+    Return configurations within the joint limits and the remaining errors (n, 3) [m]. ``max_step``
+    bounds the change of a joint in one iteration; a tool within ``tolerance`` [m] has arrived.
     """
     low, high = joint_limits(robot).T
     q = np.clip(q, low, high)
@@ -430,16 +410,10 @@ def solve_pose_ik(
     rotation_weight: float = 0.2,
     frame: str = TOOL,
 ) -> Array:
-    """Move a frame to a pose, or as near as possible, by damped least squares.
+    """Move a frame to a pose, or as near as possible, by damped least squares within joint limits.
 
-    Joints at a limit that a step would move beyond it are excluded from the step.
-
-    T_root_goal: Goal pose of the frame in the root frame, shape (4, 4).
-    q: Initial configuration, shape (dof,) [rad or m].
-    rotation_weight: Weight of the rotation error [m/rad]; 0 leaves the orientation free.
-
-    Returns:
-        The best configuration found, shape (dof,), within the joint limits.
+    Joints at a limit that a step would move beyond it are excluded from the step. The weight of the
+    rotation error is in m/rad; 0 leaves the orientation free.
     """
     from scipy.spatial.transform import Rotation  # here, because it takes time to load
 

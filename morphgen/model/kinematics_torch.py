@@ -126,9 +126,7 @@ class JointTensors:
     def motion(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Matrices A and B of a joint's motion, T = T_parent_joint + a A + b B, each (R, K, 4, 4).
 
-        For a revolute joint at position x, a = sin(x) and b = 1 - cos(x), by Rodrigues' formula
-        R = I + sin(x) K + (1 - cos(x)) K^2 with the skew matrix K of the axis. For a prismatic
-        joint, a = x and b = 0.
+        Revolute: a = sin(x), b = 1 - cos(x), by Rodrigues' formula. Prismatic: a = x, b = 0.
         """
         K = skew(self.axis)
         rotates = ~self.is_prismatic[..., None, None]
@@ -267,15 +265,9 @@ def frame_pose(chain: FrameChain, robot_index: torch.Tensor, q: torch.Tensor) ->
 def frame_jacobian(
     chain: FrameChain, robot_index: torch.Tensor, q: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the pose and the geometric Jacobian of the chain's frame in the root frame.
+    """Return the pose (n, 4, 4) and geometric Jacobian (n, 6, J) of the chain's frame.
 
-    Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 3.1.3: a revolute
-    joint with axis z and anchor p contributes (z x (p_frame - p), z), a prismatic one (z, 0).
-
-    Returns:
-        ``T_root_frame``, shape (n, 4, 4), and ``J_root_frame``, shape (n, 6, J): linear velocity of
-        the frame's origin, then angular velocity; mimic joints are folded into their leaders, and
-        columns of joints that do not move the frame are zero.
+    As ``kinematics.frame_jacobian``; columns of joints that do not move the frame are zero.
     """
     *joints, T_root_frame = _chain_frames(chain, robot_index, q)
     T_root_joint = torch.stack(joints, dim=1)
@@ -419,18 +411,11 @@ def solve_ik(
     damping: float = 0.05,
     max_step: float = 0.5,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Move tools to positions or poses by damped least squares, from several starts each.
+    """Move tools to positions or poses by damped least squares, from starts (S, n, J) each.
 
     Position and rotation have the same priority. From random starts this finds more solutions than
-    repeating ``pose_ik_step``, which is made for paths that start near their goals.
-
-    starts: Initial configurations, S of each goal, shape (S, n, J) [rad or m].
-    rotations: None if only positions matter.
-    damping: Damping [joint units per metre], more than of paths that start near.
-
-    Returns:
-        Configurations, shape (S, n, J), within the joint limits, and the remaining errors, shape
-        (S, n, 3) or, for poses as of ``pose_task``, (S, n, 6) [m].
+    repeating ``pose_ik_step``, which is made for paths that start near their goals. Return
+    configurations within the limits and errors (S, n, 3) or, as of ``pose_task``, (S, n, 6) [m].
     """
     count = len(starts)
     robot_index, positions = robot_index.repeat(count), positions.repeat(count, 1)
@@ -464,11 +449,8 @@ def pose_ik_step(
     """Move tools towards poses by one step of damped least squares, position before rotation.
 
     The rotation error is reduced only in the null space of the position task (Nakamura, Hanafusa
-    and Yoshikawa, Task-priority based redundancy control of robot manipulators, 1987). Joints that
-    would leave their limits do not move.
-
-    rotation_budget: Largest change of each joint position, shape (n, J). The rotation step is
-        shortened until no joint exceeds it. Unlimited by default.
+    and Yoshikawa, Task-priority based redundancy control of robot manipulators, 1987), and its step
+    is shortened until no joint exceeds the ``rotation_budget`` (n, J).
     """
     T_root_tool, J_root_tool = frame_jacobian(chain, robot_index, q)
     position_error = (positions - T_root_tool[:, :3, 3])[..., None]

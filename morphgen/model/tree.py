@@ -84,18 +84,11 @@ def rename(
 def scale_links(
     robot: Robot, factors: Mapping[str, float], faces: Mapping[str, Vec3] | None = None
 ) -> Robot:
-    """Scale links uniformly: their shapes, mass properties, and the joints and frames on them.
+    """Scale links about their origins: shapes, mass properties, joints and frames on them.
 
     At constant density, mass scales with the third power of the factor and inertia with the fifth.
-
-    A link is scaled about the origin of its frame. A link that touches its parent elsewhere, such
-    as at the foot of a tube below the joint frame, would then separate from its parent or sink
-    into it. ``faces`` prevents that: the joint moves so that the contact point of the scaled link
-    coincides with that of the scaled parent. If the contact point is on the joint's axis, the joint
-    frame only slides along the axis, which does not change its motion.
-
-    faces: Contact point of a link with its parent before scaling, in the link's frame [m], by
-        link name; by default the origin.
+    A link that touches its parent elsewhere than at its origin would separate from it: ``faces``
+    has these points [m] by link. A joint moves so that they coincide; along its axis if it can.
     """
     faces = faces or {}
     for name in (*factors, *faces):

@@ -242,12 +242,10 @@ class Session:
         write: Callable[[], str] | None = None,
         apply: Callable[[str], object] | None = None,
     ) -> None:
-        """Keep a value of the page in its address, by default what the address has.
+        """Keep a value of the page in its address under a key: ``write`` returns it as text.
 
-        Args:
-            key: Key of the value in the address.
-            write: Returns the value as text; empty for the default, which is left out.
-            apply: Takes over the value of an address, unless the page has read it before.
+        An empty text is the default, which is left out. ``apply`` takes over the value of an
+        address, unless the page has read it before.
         """
         self.values[key] = write or (lambda: self.address.state.get(key, "")), apply
 

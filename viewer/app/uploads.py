@@ -168,10 +168,9 @@ def _is_hidden(file: PurePosixPath) -> bool:
 def _main_description(
     name: str, formats: dict[str, str | None], documents: _Documents, unpacked: Collection[str]
 ) -> str:
-    """Return the description to show.
+    """Return the description to show: the URDF with the shortest path, in a bundle its own.
 
-    That is the URDF with the shortest path, which in a bundle is the bundle's own. Without one, it
-    is the MJCF with the archive's name, or the only one that no other MJCF includes.
+    Without one, it is the MJCF with the archive's name, or the only one that no other includes.
     """
     urdfs = [
         path

@@ -419,10 +419,8 @@ def add_charts(gui: viser.GuiApi, episode: Episode, *, dark: bool) -> list[viser
 def curves(episode: Episode, step: int) -> list[tuple[Array, ...]]:
     """Return the data of the charts of distance, score and, if recorded, reward.
 
-    Each has the time, the robots' curves, and a line at the step.
-
-    uPlot has no vertical lines; the line is a curve with three values at the step: low, high, low.
-    Robots whose episode ended earlier keep their last value: uPlot draws no curve with NaN.
+    uPlot has no vertical lines; that at the step is a curve with three values there. Robots whose
+    episode ended earlier keep their last value: uPlot draws no curve with NaN.
     """
     num_steps = max(episode.num_steps, 1)
     time = np.arange(1, num_steps + 1) * episode.period

@@ -372,10 +372,9 @@ Labels = list[tuple[str, tuple[float, float]]]  # texts on the ground and their 
 
 
 def arrange(population: Population, fact: str = "") -> tuple[Array, Labels]:
-    """Return positions (n, 2) [m] of robots in rows, x to the right, y away from the reader.
+    """Return positions (n, 2) [m] of robots in rows from the far left to the near right.
 
-    Rows run from the far left to the near right, in the order of the set. With a fact, the smallest
-    come first, and labels have the values of rows' first robots.
+    With a fact, the smallest come first, and labels have the values of rows' first robots.
     """
     rows, bounds = population.rows, population.home_bounds
     index = {row.uri: i for i, row in enumerate(rows)}

@@ -191,10 +191,7 @@ def show_inertia_findings(view: RobotView, findings: Sequence[Finding]) -> None:
 
 
 def show_workspace(view: RobotView, points: Array, outside: Triangles, y: float) -> None:
-    """Draw the shell of the tool's positions behind a vertical plane at y [m], and the slice in it.
-
-    points: Tool positions, shape (n, 3) [m]; ``outside`` is their shell.
-    """
+    """Draw the shell of tool positions (n, 3) [m] behind a plane at y [m], and the slice in it."""
     remove_overlay(view, "workspace")
     section, (vertices, faces) = cut(points, y), outside
     nodes: list[Any] = [

@@ -85,11 +85,7 @@ _MOMENTS = 8  # moments of an episode that must be in view
 
 
 def track_area(track: Track) -> tuple[Array, Array]:
-    """Return the lowest and highest corner of a robot with its surroundings [m].
-
-    They hold the motion that is known: that of a recorded episode, and of one that is simulated now
-    its start.
-    """
+    """Return the lowest and highest corner of a robot with its surroundings in its motion [m]."""
     points = [np.zeros(3)]
     every = math.ceil(len(track.q) / _MOMENTS)
     for q in [np.array(track.robot.home), *track.q[::every]]:

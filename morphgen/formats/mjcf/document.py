@@ -60,14 +60,10 @@ class MjcfDocument:
 
 
 def read_document(path: Path, finder: PackageFinder, *, with_options: bool = False) -> MjcfDocument:
-    """Read an MJCF with its includes, and resolve the files of its meshes.
+    """Read an MJCF with its includes, and resolve the files of its meshes; see docs/importing.md.
 
-    Included files come from the folders that ``require_allowed_text`` allows, meshes from those of
-    ``resolve_uri``. Their names are relative to the folder of ``path``; those of a nested include
-    also to the folder of the file that includes it. Textures, height fields and skins are not read.
-
-    MuJoCo gets the elements of an allow-list. It ignores namespaces, which would hide an element
-    from that list, so names with a namespace are refused.
+    Textures, height fields and skins are not read. MuJoCo gets the elements of an allow-list. It
+    ignores namespaces, which would hide an element from that list, so names with one are refused.
     """
     includes = _Includes(path, finder)
     root, findings = includes.read(path, 0)

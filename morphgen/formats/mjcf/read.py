@@ -78,12 +78,9 @@ _ARRAYS = (
 def compile_document(
     document: MjcfDocument,
 ) -> tuple[mujoco.MjSpec, mujoco.MjModel, tuple[Finding, ...]]:
-    """Compile a document, with the triangles of its meshes as morphgen reads them.
+    """Compile a document; return its model before and after that, and MuJoCo's warnings.
 
     No body is merged with its parent and no geom is dropped, whatever the document says.
-
-    Returns:
-        The document's model before and after the compilation, and MuJoCo's warnings.
     """
     with MujocoWarnings() as warnings:
         try:
@@ -255,22 +252,11 @@ _TOLERANCE = 1e-9  # excess over a limit at which a home position is still withi
 def read_mjcf(
     path: Path, finder: PackageFinder | None = None, *, root_body: str | None = None
 ) -> Robot:
-    """Read an MJCF, with its defaults, angles and inertias resolved by MuJoCo.
+    """Read an MJCF by the rules of docs/importing.md; MuJoCo resolves defaults, angles, inertias.
 
-    Bodies become links, hinges revolute or continuous joints, slides prismatic joints, and bodies
-    without a joint are fixed. Links without mass, named ``BODY_JOINT``, separate several joints of
-    a body. A link's frame is its body's; if the body's last hinge has a ``pos``, the frame is there
-    instead, as URDF requires. A joint's position is MuJoCo's, also with a ``ref``.
-
-    Meshes without a file and ellipsoids get one in the user's cache.
-
-    ``_robot_root`` says which bodies are the robot, ``_Reader._shapes`` which geoms are visual and
-    collision shapes, ``_Couplings`` what becomes a mimic joint, ``_efforts`` how joints get effort
-    limits, and ``_Reader._frames`` what becomes the frame ``tool``. Masses up to that of
-    ``mjcf_text`` for links without mass count as none. The keyframe ``home``, or the first one, is
-    the home configuration if it is within the limits; otherwise every joint is at its ``ref``, or
-    in the middle of its range. ``<exclude>`` makes ignored pairs. What a ``Robot`` does not hold is
-    left out: stiffness, armature, gains, sensors, cameras, lights and textures.
+    Links without mass, named ``BODY_JOINT``, separate several joints of a body. A link's frame is
+    its body's; if the body's last hinge has a ``pos``, the frame is there, as URDF requires. Masses
+    up to that of ``mjcf_text`` for links without mass count as none.
     """
     require_description_file(path)
     document = read_document(path, finder or default_finder())
@@ -286,10 +272,8 @@ def _robot_root(
 ) -> int:
     """Return the body at the root of the robot; add a finding about shapes that are left out.
 
-    With ``root_body`` it is that body; its own joints are left out. Otherwise it is the one body in
-    the world: with a free joint, which is left out, or welded to the world at its origin. If that
-    body is elsewhere or moves, or the world has shapes other than planes, the world is the root. It
-    is also the root of several bodies that all have joints, as of two arms.
+    That is ``root_body``, else the one body in the world if it is welded to the world's origin or
+    has a free joint, and the world has no shapes but planes; else the world itself.
     """
     if root_body is not None:
         names = [model.body(body).name for body in range(model.nbody)]
@@ -515,13 +499,8 @@ class _Reader:
     def _shapes(self, body: int) -> tuple[tuple[Shape, ...], tuple[Shape, ...]]:
         """Return the visual and the collision shapes of a body, in the frame of its link.
 
-        A geom without contacts (``contype`` and ``conaffinity`` are zero) in groups 0 to 2 is a
-        visual shape. A geom with contacts, or one of a ``<pair>``, is a collision shape; those of
-        groups 0 to 2 are drawn, too, if the body has no visual shapes of its own. Planes and height
-        fields of the world are its floor and left out, as are geoms that neither touch nor are
-        drawn.
-
-        An ellipsoid becomes a convex mesh of its volume, or a sphere if its radii are equal.
+        See docs/importing.md. Planes and height fields of the world are its floor and left out, as
+        are geoms that neither touch nor are drawn.
         """
         model, T_link_body = self._model, self.T_link_body[body]
         is_moved = not T_link_body.is_identity
@@ -596,12 +575,10 @@ class _Reader:
         return Mesh(self._document.meshes[asset.name], (x, y, z)), T_asset_file
 
     def _frames(self, joints: Sequence[Joint]) -> tuple[Frame, ...]:
-        """Return a frame for every site with a name.
+        """Return a frame for every site with a name, and the frame ``tool``; see docs/importing.md.
 
         A URDF has a link and a joint for a frame; a site whose name they would take from another
-        link or joint gets ``_site`` appended. If neither a site nor a link is called ``tool``, the
-        first site with a word such as ``attachment``, ``tcp`` or ``grip`` in its name is the frame
-        ``tool``, besides its own. The order of the words decides, then that of the file.
+        link or joint gets ``_site`` appended.
         """
         model = self._model
         taken = {*self.link.values(), *(end for j in joints for end in (j.parent, j.child))}
@@ -683,13 +660,7 @@ def _has_word(name: str, word: str) -> bool:
 
 
 class _Couplings:
-    """Requirements of equality constraints on the joints of a robot.
-
-    An active ``<equality><joint>`` of degree 1 is a mimic; one without ``joint2`` holds its joint.
-    An ``<equality><tendon>`` of one fixed tendon of two joints is a mimic, too. Other tendons are
-    accepted only if they merely drive joints that follow the same leader. Constraints to mocap
-    bodies outside the robot, by which users drag it, are left out with a finding. Inactive
-    constraints have no effect. All others are refused.
+    """Requirements of equality constraints on joints: docs/importing.md says which are read.
 
     Attributes:
         mimics: Leader, multiplier and offset [rad or m] of each coupled joint.
@@ -867,11 +838,9 @@ def _ref(model: mujoco.MjModel, joint: int) -> float:
 
 
 def _efforts(model: mujoco.MjModel) -> dict[int, float]:
-    """Return the effort limits by joint [N m or N].
+    """Return the effort limits by joint [N m or N]; see docs/importing.md.
 
-    A joint's ``actuatorfrcrange`` comes first. Without it, the limits of the actuators on the joint
-    are added up: their ``forcerange``, or for motors without one the ``ctrlrange`` times the gain;
-    each times the gear. A joint has no effort limit if one of its actuators has none.
+    A joint has no effort limit if one of its actuators has none.
     """
     efforts: dict[int, float] = {}
     unlimited = set()

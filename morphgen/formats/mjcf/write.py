@@ -155,24 +155,13 @@ link between a rod and a motor that pushes against it would yield by radians."""
 def mjcf_text(robot: Robot, mesh_file: MeshFile) -> str:
     """Write a robot as MJCF; the same robot gives the same bytes.
 
-    Every link becomes a body of the same name, with the root welded to the world. A root named
-    ``world``, MuJoCo's reserved name, is the world body. Visual shapes are in group 2 without
-    contacts, collision shapes in group 3. Every independent joint has a position actuator of the
-    same name with the gains of ``morphgen.model.dynamics.actuation``. Gravity is compensated
-    (``gravcomp``), as by the controllers of real arms. Mimic joints are equality constraints,
-    and have an armature, see ``COUPLED_INERTIA`` of ``morphgen.model.dynamics``. Ignored pairs are
-    ``<exclude>``, frames are sites and ``home`` is a keyframe.
+    Gravity is compensated, as by the controllers of real arms. An effort of zero counts as missing,
+    as in most URDFs. MuJoCo refuses a massless link on a moving joint, so ``<compiler>`` bounds
+    links far below any real part. ``MjSpec.to_xml`` is not used: its 6 digits move a tool by
+    micrometres.
 
-    Numbers have 12 significant digits. ``MjSpec.to_xml`` is not used because its 6 digits move a
-    tool by micrometres and change inertias by parts per million.
-
-    MuJoCo refuses a massless link on a moving joint, so ``<compiler>`` bounds links at 1e-12 kg and
-    1e-14 kg m^2, far below any real part. Armature is the motor's share of a light joint's inertia.
-    An effort of zero counts as missing, as in most URDFs: the actuator has no limit.
-
-    mesh_file: Maps a mesh to its file relative to the MJCF, such as ``meshes/hand.stl``. The
-        file must contain the mesh as the shape uses it: only its part, with scale applied.
-        MuJoCo reads STL of at most 200,000 faces and OBJ of any size.
+    mesh_file: Maps a mesh to its file relative to the MJCF, such as ``meshes/hand.stl``, which has
+    it as the shape uses it: only its part, with scale applied.
     """
     meshes = Meshes(mesh_file)
     root = _document(robot, meshes)

@@ -74,10 +74,8 @@ def read_urdf(
 ) -> Robot:
     """Read a URDF, or a xacro (by its suffix), with every mesh reference resolved.
 
-    Returns:
-        The robot, without frames unless ``written_frames``. Its home is the one that
-        ``urdf_text`` wrote, else zero, or the middle of a range without zero. What was repaired or
-        left out is listed in ``source_findings``.
+    The robot has no frames unless ``written_frames``. Its home is the one that ``urdf_text`` wrote,
+    else zero, or the middle of a range without zero.
     """
     require_description_file(path)
     finder = finder or default_finder()

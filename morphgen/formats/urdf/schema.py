@@ -213,11 +213,7 @@ _REPLACEMENT = {
 
 
 def structure_findings(root: etree._Element, origin: str) -> tuple[Finding, ...]:
-    """Check that a URDF is a kinematic tree with valid numbers.
-
-    Returns:
-        Findings in the order of detection. A document without errors can be converted.
-    """
+    """Check that a URDF is a kinematic tree with valid numbers and can be converted."""
     return tuple(replace(f, where=f"{origin}{f.where}") for f in _document_findings(root))
 
 

@@ -30,12 +30,10 @@ def urdf_pieces(shape: Shape) -> tuple[Shape, ...]:
 
 
 def joined_capsules(shapes: Iterable[tuple[str, Shape]]) -> tuple[Shape, ...]:
-    """Return the shapes of a link, with the pieces of capsules joined.
+    """Return named shapes in their order, with the pieces of capsules joined.
 
-    Three shapes in a row are joined if their names say so, and if they still are a capsule: a user
-    may have changed one.
-
-    shapes: The shapes in their order, with the names of their elements.
+    Three in a row are joined if their names say so and they still are a capsule: a user may have
+    changed one.
     """
     rows = list(shapes)
     joined = []
@@ -81,15 +79,10 @@ MeshUri = Callable[[Mesh], str]  # maps a mesh to the file name to write for it
 def urdf_text(robot: Robot, mesh_uri: MeshUri) -> str:
     """Write a robot as URDF; the same robot gives the same bytes.
 
-    Frames become massless links of the same name on fixed joints. Links without mass get an
-    explicit zero ``<inertial>``, because PyBullet reads a missing one as 1 kg. A ``<mujoco>``
-    element makes MuJoCo keep names, masses and mesh paths. Capsules, which URDF lacks, become a
-    cylinder and two spheres, which morphgen reads as a capsule. A revolute joint without limits
-    becomes ``continuous``. A missing effort or velocity becomes the default, because Pinocchio
-    refuses an incomplete ``<limit>`` and PyBullet reads it as zero.
-
-    A ``<morphgen>`` element, which loaders ignore, holds what URDF cannot express: the home
-    configuration, and which links are frames.
+    Links without mass get an explicit zero ``<inertial>``, because PyBullet reads a missing one as
+    1 kg. A missing effort or velocity becomes the default, because Pinocchio refuses an incomplete
+    ``<limit>`` and PyBullet reads it as zero. A ``<mujoco>`` element makes MuJoCo keep names,
+    masses and mesh paths; ``<morphgen>``, which loaders ignore, holds home and frames.
     """
     root = etree.Element("robot", name=robot.name)
     etree.SubElement(etree.SubElement(root, "mujoco"), "compiler", _MUJOCO_COMPILER)

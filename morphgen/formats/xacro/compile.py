@@ -109,9 +109,8 @@ def compile_xacro(
 ) -> CompiledXacro | None:
     """Expand a xacro file for all values of some of its arguments; memoised.
 
-    Returns:
-        The compiled document; None if the file uses a number other than by arithmetic, or cannot be
-        expanded for these values. Then call ``expand``, which raises the error, if any.
+    None if the file uses a number other than by arithmetic, or cannot be expanded for these values.
+    Then call ``expand``, which raises the error, if any.
     """
     stamp = path.stat().st_mtime_ns if path.is_file() else 0
     return _compiled(path, stamp, tuple(constants.items()), _Example(numbers), finder)
@@ -165,11 +164,7 @@ def trace(
     *,
     installed_only: bool = False,
 ) -> tuple[list[str], list[str]] | None:
-    """Expand a xacro file in this process with symbols in place of numbers.
-
-    Returns:
-        The texts and the expressions of a ``CompiledXacro``; None as for ``compile_xacro``.
-    """
+    """Expand a file with symbols for numbers; return the parts of a ``CompiledXacro``, or None."""
     from morphgen.formats.xacro.expand import Expansion  # loads xacro and minidom
 
     objects = {name: Traced(_symbol(name)) for name in numbers}

@@ -280,11 +280,7 @@ _CHILD_CODE = (
 def run_in_child(
     task: Callable[..., object], path: Path, finder: PackageFinder, **values: Mapping[str, str]
 ) -> Any:  # noqa: ANN401
-    """Run a function in a child process with limits.
-
-    Returns:
-        The result of the task.
-    """
+    """Run a function in a child process with limits, and return its result."""
     source = str(Path(__file__).parents[3])
     request = {
         "task": [task.__module__, task.__name__],
@@ -375,21 +371,12 @@ _FAULTS = (*MALFORMED, ExpatError)
 
 
 def expand(path: Path, args: Mapping[str, str], finder: PackageFinder) -> bytes:
-    """Expand a xacro file.
+    """Expand a xacro file to UTF-8 without XML declaration and comments.
 
-    The result depends on the files and the arguments only: the working directory plays no part,
-    ``$(optenv NAME default)`` is always its default, and ``$(env NAME)`` and ``$(cwd)`` are errors.
-
-    Threat model: the file and everything it includes may come from a stranger, and the values of
-    arguments as well. Expressions are interpreted by an allow-list and never given to Python.
-    Files are read only where ``require_allowed_text`` permits. Time, memory and size are bounded.
-
-    A file that was installed with morphgen or a data package was chosen by whoever installed it, so
-    it is expanded in this process as long as it reads installed files only. Every other file,
-    including one of the user's own library, is expanded in a child process with resource limits.
-
-    Returns:
-        The expanded document: UTF-8, no XML declaration, no comments.
+    File and arguments may come from a stranger; see docs/security.md. A file that was installed
+    with morphgen or a data package was chosen by whoever installed it, so it is expanded in this
+    process as long as it reads installed files only. Every other file is expanded in a child
+    process with limits.
     """
     path = path.absolute()
     if is_installed(path):
