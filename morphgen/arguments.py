@@ -65,10 +65,7 @@ def whole_number(
 def require_types(
     given: SimpleNamespace, error: type[MorphgenError], *texts: str, **least: int
 ) -> None:
-    """Require that arguments by name are texts, and others whole numbers of a least value, or None.
-
-    Whole numbers become ``int``.
-    """
+    """Require texts by name, and others None or whole numbers of a least value, made ``int``."""
     for name in (each for each in texts if getattr(given, each) is not None):
         text_argument(name, getattr(given, name), error)
     for name in (each for each in least if getattr(given, each) is not None):

@@ -84,10 +84,7 @@ class MissingDependencyError(MorphgenError):
 
 
 def one_line(text: str) -> str:
-    """Return text as one line: single spaces, unprintable characters escaped.
-
-    Names from files can contain line breaks or characters that control the terminal.
-    """
+    """Return text, such as a name from a file, as one line, unprintable characters escaped."""
     words = " ".join(text.split())
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in words)
 
@@ -98,15 +95,9 @@ def shortened(text: str, most: int = 80) -> str:
 
 
 def nearest(name: str, valid: Iterable[str], unlisted: Iterable[str] = ()) -> str:
-    """Return a hint for an unknown name: the closest valid one and the list, if not too long.
+    """Return a hint for an unknown name, such as ``; did you mean 'ur5'? valid: ur3, ur5``.
 
-    Args:
-        name: The unknown name.
-        valid: Valid names.
-        unlisted: Further valid names, which may be the closest one but are too many for the list.
-
-    Returns:
-        Text to append to an error, such as ``; did you mean 'ur5'? valid: ur3, ur5``.
+    It is the closest valid or unlisted name, and the list of valid ones if not too long.
     """
     choices = sorted(valid)
     if len(name) > _MAX_COMPARED:

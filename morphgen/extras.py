@@ -37,10 +37,7 @@ def missing_extra(error: Exception, wanted: str = "") -> str | None:
 
 @contextmanager
 def explain_missing_extras(wanted: str = "") -> Iterator[None]:
-    """Convert the failed import of an optional package to an error that says how to install it.
-
-    wanted: The extra of morphgen to install, if it has the package.
-    """
+    """Convert the failed import of an optional package to an error with the wanted extra."""
     try:
         yield
     except ModuleNotFoundError as error:

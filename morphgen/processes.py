@@ -77,10 +77,7 @@ def parallel_stream(
 ) -> Iterator[Iterator[R]]:
     """Yield an iterator over ``work(item)`` in order, of items that may never end.
 
-    Workers are at most ``jobs`` items ahead of those that are known to be needed, and stop at the
-    end of the block.
-
-    missing: Returns how many more results are needed, at least.
+    Workers are at most ``jobs`` items ahead of the least number that ``missing`` says is needed.
     """
     jobs = whole_number("jobs", jobs, MorphgenError, 1)
     if jobs == 1:
@@ -177,11 +174,9 @@ def sigint_blocked() -> Iterator[None]:
 
 
 def init_worker(stopped: c_byte) -> None:
-    """Initialise a worker process.
+    """Initialise a worker process, which ignores Ctrl-C and a closed terminal.
 
-    It ignores Ctrl-C and a closed terminal, which its parent receives, too; it exits when the
-    parent process ends, and interrupts its work when the parent sets ``stopped``, which is in
-    memory that all processes share.
+    It exits when its parent does, and stops work when that sets the shared ``stopped``.
     """
     global _stopped
     _stopped = stopped
@@ -255,10 +250,7 @@ def _process_chunk(items: Sequence[Any]) -> list[Any]:
 
 @contextmanager
 def _working() -> Iterator[Callable[[], bool]]:
-    """Let the work in this block be interrupted; yield a function that says if it is needed.
-
-    Once the parent has stopped, nobody needs the results.
-    """
+    """Let work in this block be interrupted; yield a function that says if it is needed."""
     global _is_working, _is_interruptible
     stopped = _stopped
     if stopped is None:

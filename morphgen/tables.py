@@ -50,16 +50,10 @@ def table(
 ) -> str:
     """Return a table, in a block of ``fitted`` with as many columns as its width holds.
 
-    Columns are left out from the right, after those of ``last``; texts are shortened to half of the
-    width, and further where that keeps a column. A line below names the columns that are left out.
-    Tables of Markdown are always whole.
-
-    Args:
-        rows: Cells, as many in each row as there are headers.
-        headers: Titles of the columns; in style ``plain`` a row like the others, without padding.
-        style: One of tabulate's.
-        formats: Format of numbers, for all columns or for each; by default all cells are texts.
-        last: Titles of the columns that are left out first, in this order.
+    Columns are left out from the right, after those of ``last`` in that order; texts are shortened
+    to half of the width, and further where that keeps a column. A line below names the columns that
+    are left out. Tables of Markdown are always whole. In style ``plain`` headers are a row like the
+    others, without padding; cells are texts unless ``formats`` says otherwise.
     """
     if formats is None or isinstance(formats, str):
         number_formats = [formats or "g"] * len(headers)

@@ -74,10 +74,9 @@ def parse_value(control: Any, text: str, keys: Sequence[str] = ()) -> Any:  # no
 
 
 def joint_roles(robot: Robot) -> list[str]:
-    """Return the role of every independent joint, in the order of q.
+    """Return the role of every independent joint: ``joint 1`` is the first that moves the tool.
 
-    ``joint 1`` is the first joint on the path from the root to the tool, perhaps through a mimic
-    joint; ``finger 1`` the first that does not move the tool.
+    Others, such as ``finger 1``, do not.
     """
     on_path: tuple[int, ...] = ()
     if has_tool(robot):

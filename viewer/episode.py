@@ -170,10 +170,7 @@ class Episode:
 
 
 def score_until(track: Track, task: str, step: int) -> float | None:
-    """Return an episode's score as if it had ended after a number of steps; None at the start.
-
-    See ``Task.episode_score``. Steps beyond the end of the track do not count.
-    """
+    """Return an episode's score as if it had ended at a step of its track; None at the start."""
     scores = track.score[:step]
     if not scores:
         return None

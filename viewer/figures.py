@@ -64,10 +64,7 @@ def map_svg(
 
 
 def map_cells(points: Array) -> NDArray[np.intp]:
-    """Return a cell (column, row) for each point (n, 2), each another one and near its point.
-
-    The points fill the map; a fifth of its cells or more stay free.
-    """
+    """Return a cell (column, row) of its own near each point (n, 2); a fifth stay free."""
     n = len(points)
     columns = max(_MIN_COLUMNS, round(math.sqrt(_MAP_ASPECT * n)))
     rows = max(math.ceil(1.25 * n / columns), round(columns / _MAP_ASPECT))

@@ -151,10 +151,9 @@ def read_robot_uri(uri: str, files: FileAccess) -> Robot:
 
 
 def _require_readable_upload(uri: str, path: Path, files: FileAccess) -> None:
-    """Require that a file of an upload is one that pages read.
+    """Require that a file of an upload is one that pages read: no xacro, which is a program.
 
-    A xacro is a program: those of an upload are never expanded. An address may name any MJCF of an
-    upload, also one that another includes, so their files are checked whenever they are read.
+    An address may name any MJCF of an upload, so its files are checked whenever they are read.
     """
     if path.suffix.lower() not in (".urdf", ".xml"):
         raise UriError(f"{shorten(uri)}: only a URDF, an MJCF or a bundle is read from an upload")
@@ -233,10 +232,9 @@ def resolve_member(uri: str, files: FileAccess) -> Member:
 
 
 def with_library_meshes(robot: Robot, library: Library) -> Robot:
-    """Return the robot with the meshes of the library's parts, for which fits are stored.
+    """Return a bundle's robot with the library's meshes, for which fits are stored.
 
-    A bundle has copies of these meshes. A robot is returned unchanged if its derivation does not
-    compose to the same URDF, apart from the names of the meshes.
+    It is unchanged if its derivation does not compose to the same URDF, apart from meshes.
     """
     text = robot.provenance.get("derivation")
     if not text:

@@ -110,10 +110,7 @@ def _read_controller(policy: str, task: str, files: FileAccess) -> ControllerSpe
 
 
 def training_robots(policy: str, files: FileAccess) -> tuple[str, bool, list[tuple[str, str]]]:
-    """Return task, obstacles, names and URIs of the robots of a checkpoint's training.
-
-    There are no robots if they were drawn and their list is missing.
-    """
+    """Return task, obstacles, names and URIs of a checkpoint's robots; none if not listed."""
     path = checkpoint_path(policy, BASELINES, files)
     source = read_checkpoint(path)[0].source
     rows = robot_source.members(source)
@@ -231,10 +228,7 @@ def list_episodes(
 
 @one_torch_thread()
 def recorded_episode(folder: str, index: int, files: FileAccess) -> Episode:
-    """Return an episode of demonstrations, in the states that were recorded.
-
-    The state after the last step was not: the one before it is shown twice.
-    """
+    """Return an episode as recorded; the state before the last step stands for the last."""
     demos = _demonstrations(folder, files)
     if not 0 <= index < len(demos.episodes):
         last = len(demos.episodes) - 1

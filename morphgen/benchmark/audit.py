@@ -283,10 +283,7 @@ def audit_with_goals(
 def audit_goals(
     split: Split, goals: SplitGoals, library: Library, *, jobs: int = 1
 ) -> tuple[Finding, ...]:
-    """Find goals that leak, and sets that do not match the split's robots.
-
-    Every set is sampled anew for comparison, and every goal is tested with its configuration.
-    """
+    """Find leaked goals, and sets that differ from those sampled anew or do not match robots."""
     members = sided_members(split)
     examined = list(parallel_map(partial(_examine, library, goals), members, jobs))
     return (

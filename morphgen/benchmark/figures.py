@@ -48,10 +48,7 @@ def _default_style() -> Iterator[None]:
 
 @_default_style()
 def heatmap_png(names: Sequence[str], matrices: Mapping[str, Array]) -> bytes:
-    """Draw matrices by measure side by side, bright where robots are similar; return the PNG.
-
-    Up to ``MAX_NAMED`` robots are named, and up to ``MAX_WITH_VALUES`` have their values written.
-    """
+    """Draw matrices by measure side by side, bright where robots are similar; return the PNG."""
     n = len(names)
     side = max(_MIN_SIDE, n * _ROW_HEIGHT) if n <= MAX_NAMED else _UNNAMED_SIDE
     margin = _LETTER_WIDTH * max(map(len, names)) if n <= MAX_NAMED else 0.3

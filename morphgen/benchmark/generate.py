@@ -35,10 +35,7 @@ from morphgen.splits.split import COMPOSED, MAX_LINKS_KEY, Member, Regime, Split
 
 
 def stream_seed(seed: int, prefix: str) -> int:
-    """Return the seed of the robots with one name prefix.
-
-    It depends on the prefix, so robots do not change with the other robots that a split samples.
-    """
+    """Return the seed of robots with one name prefix, whatever others a split samples."""
     return int(np.random.SeedSequence([seed, *prefix.encode()]).generate_state(1)[0])
 
 
@@ -101,10 +98,7 @@ class RobotStream:
         return SampledRecipe(self.grammar, number, self.seed, numbered_name(self.prefix, number))
 
     def derivation(self, number: int, library: Library) -> Derivation | None:
-        """Return the first derivation drawn for a robot; None if it has too many parts.
-
-        The robot has this derivation unless its conditions reject it.
-        """
+        """Return the first derivation drawn, which conditions may reject; None if too large."""
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
         try:
             return derive(self.grammar, library, RecordedChooser(RandomChooser(rng)))
@@ -239,11 +233,7 @@ def assemble_drawn(
 def interpolation(
     request: SplitRequest, grammar: Grammar, library: Library, *, hull: str = "any", jobs: int = 1
 ) -> tuple[Split, ...]:
-    """Return splits whose test robots have the structure of a train robot.
-
-    Train robots are numbers 0, 1, ... of the grammar with one seed; test robots are sampled with
-    another seed.
-    """
+    """Return splits whose test robots, of another seed, have the structure of a train robot."""
     require_size(request)
     if hull not in HULLS:
         raise BenchmarkError(f"--hull {hull}: unknown{nearest(hull, HULLS)}")
@@ -285,8 +275,7 @@ def composition(
 ) -> tuple[Split, ...]:
     """Return splits whose test robots have only trained parts, in an untrained combination.
 
-    With several tasks, a candidate is a robot with one task, and the split composes robots with
-    tasks: the outermost part of a test robot is in no train robot of its task, but in others.
+    With several tasks, it is one with the task, for the outermost part of a test robot.
     """
     candidates = list(_candidates(patterns, request.tasks, library))
     sequence = np.random.SeedSequence(request.seed)
@@ -350,9 +339,8 @@ def hold_out_combinations(
 ) -> tuple[list[RuledRobot], list[RuledRobot]]:
     """Choose test candidates of as many combinations as possible; return them and train candidates.
 
-    Candidates with the combination of a test candidate are excluded from training, for all tasks.
-    With several tasks, candidates with the outermost part and the task of a test candidate are
-    excluded, too. The first few train candidates cover every part and task of the test candidates.
+    Candidates with a test candidate's combination, or its outermost part and task, are not trained.
+    The first few train candidates cover every part and task of the test candidates.
     """
     rng = np.random.default_rng(seed)
     max_held = 0  # most test candidates of an attempt, for the message
@@ -435,10 +423,7 @@ _BOUND = re.compile(r"\s*([<>])\s*(\d+\.?\d*|\.\d+)\s*")
 
 @dataclass(frozen=True)
 class Bound:
-    """Bound on the cosine similarity of a test robot to the nearest train robot.
-
-    It is the largest cosine, because a mean would hide one near duplicate among other robots.
-    """
+    """Bound on the largest cosine similarity of a test robot to any train robot."""
 
     is_upper: bool  # whether the cosine must be below `value`; above it otherwise
     value: float
@@ -470,10 +455,7 @@ def extrapolation(
     similarity: Bound | None = None,
     jobs: int = 1,
 ) -> tuple[Split, ...]:
-    """Return splits whose test robots share no grammar and no structure with a train robot.
-
-    Robots are sampled from the grammars in turn, so each grammar gives equally many.
-    """
+    """Return splits whose test robots share no grammar and no structure with a train robot."""
     require_size(request)
     _require_apart(train_grammars, test_grammars)
     train_streams, test_streams = (

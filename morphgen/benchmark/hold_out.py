@@ -400,10 +400,9 @@ def _replace_values(
 def _stratified(
     drafts: Mapping[int, _Draft], n: int, needed: frozenset[str] = frozenset()
 ) -> list[int]:
-    """Return the numbers of up to n drafts, each the best one after those before it.
+    """Return up to n drafts, each the best after those before: of the rarest strata.
 
-    It is the one whose strata occur least among those; of several, the one with most of the needed
-    parts that those lack.
+    Of several, it is the one with most of the needed parts that those lack.
     """
     counts: Counter[_Item] = Counter()
     missing = set(needed)

@@ -42,10 +42,7 @@ class PatternRobot:
 
 
 def pattern_robots(pattern: str, library: Library) -> list[PatternRobot]:
-    """Return the robots that a pattern stands for: every choice in braces with every other one.
-
-    A wildcard such as ``ee=*`` stands for all parts that fit; the part ``none`` must be named.
-    """
+    """Return a pattern's robots: ``ee=*`` is all parts that fit; ``none`` must be named."""
     robots: list[PatternRobot] = []
     for words in expand(pattern):
         choices = [_matching(word, pattern, library) for word in words]
@@ -185,10 +182,7 @@ def hull_distance(point: ArrayLike, points: ArrayLike) -> float:
 
 
 def regime_findings(split: Split, library: Library) -> tuple[Finding, ...]:
-    """Return the violations of a split's regime that the derivations show; see docs/splits.md.
-
-    What is held out is tested by ``hold_out_findings``, on all robots of a split.
-    """
+    """Return the violations of a split's regime that the derivations show; see docs/splits.md."""
     train = [RuledRobot.of(member, library) for member in split.train]
     test = [RuledRobot.of(member, library) for member in split.test]
     tasks = {robot.task for robot in train}
@@ -258,10 +252,7 @@ class RuledRobot:
 def regime_violations(
     regime: Regime, provenance: Mapping[str, object], test: RuledRobot, train: Sequence[RuledRobot]
 ) -> Iterator[Finding]:
-    """Yield how a test robot violates the rule of a regime; see ``regime_findings``.
-
-    Generators draw another robot where an audit would have a finding.
-    """
+    """Yield how a test robot violates the rule of a regime; generators then draw another."""
     if regime == "interpolation":
         return _interpolation(str(provenance.get("hull", "any")), test, train)
     if regime == "composition":

@@ -232,10 +232,7 @@ def card_text(
     names: Iterable[str],
     rows: Sequence[surveys.RobotDifficulty],
 ) -> str:
-    """Return the dataset card.
-
-    names: Paths of the files of the release.
-    """
+    """Return the dataset card; ``names`` are the paths of the files of the release."""
     present = {name.partition("/")[0] for name in names}
     # Every release has the other files of the table.
     absent = {"goals", SCORES_FILE, SUBMISSIONS_DIR} - present
@@ -313,10 +310,7 @@ def build_with_goals(
 
 
 def write_goals(home: Path, results: Sequence[GoalResult], config: GoalConfig) -> Path:
-    """Write the goal sets of a split into the folder where it is built; return their folder.
-
-    The checksums of the split are updated, and earlier sets replaced.
-    """
+    """Write goal sets into a split's folder in place of earlier ones; return their folder."""
     require_goal_sets(results)
     folder = home / GOALS
     files = dict(goal_files(results, config))

@@ -374,10 +374,9 @@ def build_split(
     jobs: int = 1,
     settings: BuildSettings = BUNDLED,
 ) -> BuildReport:
-    """Write a split and all its robots to ``folder / split.name``.
+    """Write a split and all its robots to ``folder / split.name``, always the same bytes.
 
-    Robots that an interrupted build has written are kept if they are correct. The same split gives
-    the same bytes.
+    Robots that an interrupted build has written are kept if they are correct.
     """
     split_folder = split_folder_path(split, folder)
     members = unique_robots(split)
@@ -564,10 +563,7 @@ def _robot_differences(
 def compare_folder(
     folder: Path, split: Split, library: Library, *, with_features: bool, jobs: int
 ) -> tuple[list[Difference], Mapping[str, SurveyedRobot]]:
-    """Compare the files of a split folder with ``SHA256SUMS`` and with the robots of its split.
-
-    Returns also the robots by hash, or none if one of them cannot be composed.
-    """
+    """Compare a split folder with ``SHA256SUMS`` and its robots; return also these, by hash."""
     build, found = read_settings(folder / BUILD_FILE), list[Difference]()
     if build.split != split_id(split):
         why = f"it is of split {build.split}, not of {SPLIT_FILE}"

@@ -381,10 +381,7 @@ def train_similarity(survey: SplitSurvey, index: int) -> Array:
 
 
 def nearest_train(train: Sequence[Member], similarity: Array) -> dict[str, NearestTrain]:
-    """Return the train robot that is nearest by each measure, if there is one to compare with.
-
-    similarity: Similarity to the train robots, shape (n_train, n_measures).
-    """
+    """Return the nearest train robot by each measure of similarity (n_train, n_measures)."""
     return {
         name: NearestTrain(train[best].name, float(values[best]))
         for name, values in zip(MEASURES, similarity.T, strict=True)
@@ -410,10 +407,7 @@ STRUCTURAL = (
 
 
 def difficulty_csv(rows: Sequence[RobotDifficulty], baselines: Sequence[str] = ()) -> str:
-    """Return a CSV table with a line per robot: ``STRUCTURAL``, then two columns per baseline.
-
-    The same rows give the same text. Cells without a value are empty.
-    """
+    """Return a CSV table with a line per robot: ``STRUCTURAL``, then two columns per baseline."""
     text = io.StringIO()
     results = (f"{name}_{key}" for name in baselines for key in ("score", "success"))
     columns = (*STRUCTURAL, *results)

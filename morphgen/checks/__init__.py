@@ -22,19 +22,10 @@ _SEVERITY_RANK = {"error": 0, "warning": 1, "info": 2}
 def check(
     robot: Robot, *, tool_required: bool = True, home_tested: bool = False
 ) -> tuple[Finding, ...]:
-    """Run every check on a robot.
+    """Run every check on a robot; findings are sorted by severity, code and place.
 
-    Args:
-        robot: The robot.
-        tool_required: Whether a missing or immobile tool is a finding; False for parts.
-        home_tested: Whether ``survey_collisions`` has already tested the home configuration, so
-            that the self-collision check can be skipped.
-
-    Returns:
-        Findings, sorted by severity, code and place.
-
-    Raises:
-        MeshError: If the meshes have too many triangles in all.
+    Without ``tool_required`` a missing or immobile tool is none, as for parts. With ``home_tested``
+    ``survey_collisions`` has tested the home configuration already.
     """
     require_bounded_meshes(robot)
     checks = (*CHECKS, check_tool) if tool_required else CHECKS
@@ -48,10 +39,7 @@ def check(
 
 
 def _apply_accepted(finding: Finding, robot: Robot) -> Finding:
-    """Lower a finding to ``info`` if a part's manifest accepts it and gives a reason.
-
-    A finding about two links is accepted if either of them accepts it.
-    """
+    """Lower a finding to ``info`` if the part of one of its links accepts it with a reason."""
     accepted = cast(Mapping[str, Mapping[str, str]], robot.provenance.get("accepted", {}))
     for name in finding.where.partition(" ")[2].split(", "):  # kind, then names
         reason = accepted.get(name, {}).get(finding.code)
@@ -61,23 +49,13 @@ def _apply_accepted(finding: Finding, robot: Robot) -> Finding:
 
 
 def fix(robot: Robot) -> tuple[Robot, tuple[Finding, ...]]:
-    """Apply all safe repairs to a robot.
-
-    Args:
-        robot: The robot.
-
-    Returns:
-        The repaired robot, whose provenance lists the repairs, and the repaired findings.
-    """
+    """Return a robot with all safe repairs, listed in its provenance, and repaired findings."""
     fixable = tuple(f for f in check(robot, tool_required=False) if f.fixable)
     return (record_repairs(repaired(robot, fixable), fixable) if fixable else robot), fixable
 
 
 def record_repairs(robot: Robot, findings: tuple[Finding, ...]) -> Robot:
-    """Return a robot whose provenance, and therefore its card, lists further repairs.
-
-    The findings of its source file are cleared, because the repaired robot does not have them.
-    """
+    """Return a robot whose card lists further repairs, without the findings of its source file."""
     earlier = cast(list[str], robot.provenance.get("repairs", []))
     repairs = [*earlier, *(f"{finding.where}: {finding.repair}" for finding in findings)]
     return replace(robot, provenance={**robot.provenance, "repairs": repairs}, source_findings=())

@@ -136,10 +136,7 @@ def conformance(bundle_dir: Path, samples: int = 100, seed: int = 0) -> Conforma
 
 
 def compare(robot: Robot, folder: Path, samples: int = 100, seed: int = 0) -> ConformanceReport:
-    """Compare a robot with ``robot.urdf`` and ``robot.xml`` in a folder; see ``conformance``.
-
-    The loaders open the folder, so it must be morphgen's own or a ``loader_copy``.
-    """
+    """Compare a robot with its files in a folder of morphgen's own or a ``loader_copy``."""
     samples = whole_number("samples", samples, FormatError, 1)
     seed = whole_number("seed", seed, FormatError, 0)
     frame = next((frame for frame in robot.frames if frame.name == TOOL), None)
@@ -205,10 +202,7 @@ def _positions(robot: Robot, q: Array) -> dict[str, Array]:
 def _row(
     loader: Loader, robot: Robot, folder: Path, frame: str, q: Array, *, has_gains: bool
 ) -> tuple[ConformanceRow, Reading | None]:
-    """Return a loader's row, and what it read unless it refused the file.
-
-    ``has_gains`` says that the actuators are those that morphgen writes.
-    """
+    """Return a loader's row, and what it read unless it refused the file."""
     if find_spec(loader.module) is None:
         return ConformanceRow(loader.name, None, message="not installed"), None
     reading = _read(loader, folder, frame, _positions(robot, q), len(q))

@@ -127,8 +127,7 @@ def hold_files(robot: Robot, folder: Path) -> tuple[HoldRow, ...]:
 def with_causes(row: HoldRow, robot: Robot, hold: Callable[[Robot], HoldRow]) -> HoldRow:
     """Add the causes to the row of a robot that fails without a known one.
 
-    A property of the joints is a cause if the robot fails with it and passes, or fails only for
-    known causes, without it.
+    That is a property of the joints without which it passes, or fails only for known causes.
     """
     if not row.is_unexplained:
         return row
@@ -234,8 +233,7 @@ def _stepped(
 def step_targets(robot: Robot) -> Array:
     """Return the targets of the steps, shape (n_steps, dof) [rad or m].
 
-    Each is the home configuration with one joint moved by ``STEP`` in the direction of more room.
-    A joint without room has none.
+    Each is home with one joint moved by ``STEP`` where there is more room; none without room.
     """
     targets = []
     for i, k in enumerate(robot.independent_joints):

@@ -142,10 +142,9 @@ def bullet_client() -> Iterator[Any]:
 
 
 def read_pybullet(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
-    """Read the URDF with PyBullet, with a floating base, because a fixed one reports no mass.
+    """Read the URDF with PyBullet with a floating base, because a fixed one reports no mass.
 
-    The forces and inertia are those of a second body with a fixed base. PyBullet is asked for the
-    inertia of the file, instead of which it takes that of the collision shapes by default.
+    Forces and inertia are those of a second body with a fixed base, by the inertia of the file.
     """
     with quiet(), bullet_client() as client:
         body = client.loadURDF(str(folder / URDF))
@@ -306,10 +305,7 @@ def load_model(path: Path) -> mujoco.MjModel:
 
 
 def read_mujoco(file: str, folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
-    """Read ``robot.urdf`` or ``robot.xml`` with MuJoCo.
-
-    A free joint at the root is left out, and poses are relative to it.
-    """
+    """Read ``robot.urdf`` or ``robot.xml`` with MuJoCo, relative to a free root."""
     import mujoco
 
     model = load_model(folder / file)

@@ -190,9 +190,7 @@ def _part_links(robot: Robot, label: str) -> list[str]:
 def _gripper_links(robot: Robot, tool: Frame) -> list[str]:
     """Return the links of a gripper, from the hand that carries its joints on; none without one.
 
-    Joints of the gripper are behind the last joint that moves the tool, but do not move it. A hand
-    that this last joint moves directly is a link of the arm: MoveIt adds to a group the joints
-    above its links.
+    A hand that the last joint before the tool moves is of the arm: MoveIt adds links above joints.
     """
     chain = robot.joint_chain(tool.link)
     moving = [k for k in chain if robot.joints[k].is_movable]

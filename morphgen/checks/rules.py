@@ -125,11 +125,7 @@ def _is_mass_valid(inertial: Inertial) -> bool:
 
 
 def _inertia_fault(inertial: Inertial) -> str | None:
-    """Return why no rigid body with positive mass can have this inertia; None if it is possible.
-
-    The principal moments must be positive and each smaller than the sum of the other two, which it
-    equals only for bodies without thickness.
-    """
+    """Return why no rigid body with positive mass can have this inertia; None if one can."""
     if not np.isfinite(inertial.matrix).all():
         return f"inertia {inertial.inertia} is not finite"
     low, middle, high = np.linalg.eigvalsh(inertial.matrix).tolist()
@@ -147,10 +143,9 @@ def _gyration_radii(inertial: Inertial) -> Array:
 
 
 def _unit_density_inertial(link: Link) -> Inertial | None:
-    """Return the mass properties of a link's solid shapes at 1 kg/m^3.
+    """Return the mass properties of a link's solid shapes at 1 kg/m^3, else of its visual ones.
 
-    Collision shapes count, or visual ones if there are none. Returns None if there are no shapes,
-    if one is invalid, or if all are flat.
+    Return None if there are no shapes, if one is invalid, or if all are flat.
     """
     shapes = link.collisions or link.visuals
     if not shapes or not all(has_hull(shape.geometry) for shape in shapes):
@@ -161,10 +156,7 @@ def _unit_density_inertial(link: Link) -> Inertial | None:
 
 
 def _with_possible_inertia(link: Link) -> Link:
-    """Return a link with the inertia of its solid shapes at its own mass.
-
-    Without shapes it is the inertia of a ball of ``DEFAULT_DENSITY``.
-    """
+    """Return a link with the inertia of its solid shapes, or of a ball, at its own mass."""
     assert link.inertial is not None
     solid, mass = _unit_density_inertial(link), link.inertial.mass
     if solid is None:
@@ -649,10 +641,7 @@ def _safe_robot_name(name: str) -> str:
 
 
 def safe_names(names: Iterable[str], reserved: Iterable[str] = ()) -> dict[str, str]:
-    """Return a safe, unique new name for every name; safe names that are not reserved stay.
-
-    Safe names have letters, digits, ``_``, ``-`` and ``.`` only, and at least one.
-    """
+    """Return a safe, unique name for every name; it stays if it is both and not reserved."""
     names, reserved = tuple(names), tuple(reserved)
     kept = {name for name in names if name and not _UNSAFE.search(name) and name not in reserved}
     taken = {*kept, *reserved}

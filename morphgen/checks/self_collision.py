@@ -45,10 +45,7 @@ class SelfCollisionChecker:
     def __init__(
         self, robot: Robot, ignore: Iterable[Pair] | None = None, margin: float = 0.0
     ) -> None:
-        """Compile the collision model.
-
-        margin: Links that are nearer than this count, too, with a negative depth [m].
-        """
+        """Compile the model; links nearer than the margin [m] count, with a negative depth."""
         import mujoco  # here, because commands that test no collisions should start quickly
 
         self._robot = robot
@@ -73,10 +70,7 @@ class SelfCollisionChecker:
         self._model.body_quat[body] = T_parent_joint.quaternion
 
     def penetrations(self, q: ArrayLike) -> Iterator[dict[Pair, float]]:
-        """Yield the links that penetrate at each configuration of q (n, dof), with depths [m].
-
-        A configuration is tested when the iterator reaches it. Depths are above ``PENETRATION``.
-        """
+        """Yield, when asked, links that penetrate at each of q (n, dof), with depths [m]."""
         rows = self._require_rows(q)
         return (self._test(positions) for positions in movable_positions(self._robot, rows))
 
@@ -204,18 +198,14 @@ def _always_penetrating(checker: SelfCollisionChecker, q: Array, pairs: set[Pair
 
 
 def untested_pairs(robot: Robot) -> tuple[Pair, ...]:
-    """Return the pairs that no collision test considers: ``ignore_pairs`` and adjacent links.
-
-    Robots that morphgen composed ignore adjacent links already; those read from a file may not.
-    """
+    """Return the pairs that no collision test considers: ``ignore_pairs`` and adjacent links."""
     return tuple(sorted({*robot.ignore_pairs, *adjacent_pairs(robot)}))
 
 
 def adjacent_pairs(robot: Robot) -> tuple[Pair, ...]:
     """Return the pairs of links in one rigid group or across one movable joint, sorted.
 
-    Only links with collision shapes are named. A group without any is skipped: the groups on both
-    sides of it are adjacent.
+    Only links with collision shapes count; groups on both sides of one without any are adjacent.
     """
     groups = rigid_groups(robot)
     group_of = {link.name: i for i, group in enumerate(groups) for link in group.links}

@@ -19,10 +19,7 @@ if TYPE_CHECKING:  # imported when a command runs, so that Ctrl-C meanwhile is c
 
 
 def build_parser(words: Sequence[str] = ()) -> Parser:
-    """Return the parser of every command; each sets ``run``, which may return an exit code.
-
-    words: A command line; its command is the only one if it has one.
-    """
+    """Return the parser of every command, or of the one that the words have."""
     from morphgen.cli.command import Parser, add_commands, read_commands
 
     parser = Parser(
@@ -34,11 +31,9 @@ def build_parser(words: Sequence[str] = ()) -> Parser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command.
+    """Run a command and return its exit code: 0 for success, 1 for findings, 2 for invalid input.
 
-    Returns:
-        0 for success, 1 for findings or failed checks, 2 for invalid input; 130 when interrupted,
-        143 when terminated, 129 when the terminal was closed.
+    It is 130 when interrupted, 143 when terminated, 129 when the terminal was closed.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):  # names may have letters that a terminal lacks
         sys.stdout.reconfigure(errors="backslashreplace")

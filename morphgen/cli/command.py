@@ -337,10 +337,7 @@ class _FullHelp(argparse._HelpAction):
 
 
 class _CommandAfterOptions(argparse._SubParsersAction):  # type: ignore[type-arg]  # not at run time
-    """Chooses a command of a group that has options of its own.
-
-    The command's defaults would replace options that stand before it, so they are refused.
-    """
+    """Chooses a command of a group; it refuses options before it, which would be replaced."""
 
     def __call__(
         self,

@@ -99,9 +99,8 @@ def for_each_robot(
 ) -> tuple[dict[str, T], dict[str, dict[str, str]]]:
     """Do something with every robot that the arguments name; a refused one does not stop others.
 
-    Returns:
-        The results by the label of the source, and the class and message of the errors by the
-        label of those that failed, which are printed. With any of these, the exit code is 2.
+    Return results, and classes and messages of printed errors, for which the exit code is 2, by the
+    label of the source.
     """
     results: dict[str, T] = {}
     refused: dict[str, dict[str, str]] = {}

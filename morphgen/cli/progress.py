@@ -244,10 +244,7 @@ class TrainingProgress(_StagedBar):
         )
 
     def training(self, subrun: Subrun) -> ShowMetrics:
-        """Begin with a subrun; return the function that shows its metrics.
-
-        A line at its end says how many of its episodes diverged, if any did.
-        """
+        """Begin with a subrun; return the function that shows its metrics and what diverged."""
         from morphgen.rl.runs.robot_source import RecordedSource, SplitSource, tasks_of
 
         raise_if_interrupted()

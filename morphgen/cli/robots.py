@@ -49,10 +49,7 @@ Written: TypeAlias = tuple[dict[str, object], str, int]
 
 
 def write_checked(robot: Robot, args: argparse.Namespace) -> Written:
-    """Check a robot, write ``args.out / robot.name``, and return what to print.
-
-    The exit code is 1 if the checks find an error in the robot, as ``morphgen check`` does.
-    """
+    """Check a robot, write ``args.out / robot.name``, and return text and code of ``check``."""
     folder = bundle_folder(args.out, robot.name)
     with status(args, f"checking and writing {folder}"):
         findings = check(robot)

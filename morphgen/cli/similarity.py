@@ -86,10 +86,7 @@ def similarity(args: argparse.Namespace) -> None:
 
 
 def _features(args: argparse.Namespace) -> tuple[list[Features], list[str], list[str]]:
-    """Return the features of the robots, their names and groups.
-
-    Equal names are replaced by labels.
-    """
+    """Return the features of the robots, their names (labels where equal) and groups."""
     pairs, library = opt.read_robots(args), opt.library_of(args)
     if len(pairs) < 2:
         raise BenchmarkError(f"{pairs[0][0].label} is one robot; name others to compare it with")

@@ -59,10 +59,7 @@ def _wait(host: str, viewer: Viewer) -> None:
 
 
 def _give_up(viewer: Viewer) -> None:
-    """End the process although work still runs, such as a library that cannot be interrupted.
-
-    Python itself would wait for all threads, and for the worker processes.
-    """
+    """End the process although threads work that cannot be interrupted."""
     for process in multiprocessing.active_children():
         process.kill()
     viewer.uploads.cleanup()

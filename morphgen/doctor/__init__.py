@@ -37,10 +37,7 @@ class Entry:
 
 
 def attempt(name: str, examine: Callable[[], Entry]) -> Entry:
-    """Return the result of a function; if it raises, the result says why.
-
-    A broken package may raise anything, and every reason is of interest here.
-    """
+    """Return the result of a function; whatever it raises, the result says why."""
     try:
         return examine()
     except Exception as error:

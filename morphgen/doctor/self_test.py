@@ -139,10 +139,7 @@ def _policies() -> Entry:
 
 
 def self_test() -> Iterator[Entry]:
-    """Compose a robot, check it, load it, step it and draw it; stop if it cannot be composed.
-
-    Drawing is not needed for anything else, so its failures are warnings.
-    """
+    """Compose a robot, check it, load it, step it and draw it; failures to draw are warnings."""
     try:
         library = default_library()
         robot = compose(parse_words([ROBOT], library)[0], library, ROBOT)

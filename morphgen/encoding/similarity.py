@@ -358,10 +358,7 @@ def edit_distance(a: LabelledTree, b: LabelledTree) -> float:
 def change_costs(a: LabelledTree, b: LabelledTree) -> Array:
     """Return the cost to change each node of one tree to each of the other, (n_a, n_b), in [0, 1].
 
-    It is a sum of metrics, and therefore a metric, of these differences: the kind of joint; the
-    angle between the axes regardless of their sign, relative to a right angle (1 if only one joint
-    is fixed); the relative difference of the lengths; the kind of primitive; and the mean relative
-    difference of its extents.
+    It is a sum of metrics: see docs/similarity.md. Signs of axes do not count.
     """
     kind = a.kinds[:, None] != b.kinds
     one_fixed = (a.kinds == _FIXED)[:, None] != (b.kinds == _FIXED)
@@ -410,20 +407,16 @@ class Measure:
 
 
 def features(robot: Robot, shapes: Mapping[str, Shape], *, max_links: int = MAX_LINKS) -> Features:
-    """Compute the properties of a robot that the measures compare.
-
-    shapes: One primitive per link with geometry, by link name, as from ``token_shapes``.
-    """
+    """Compute the properties of a robot, with its token shapes, that the measures compare."""
     table = tokens(robot, shapes, max_links=max_links)[:, : POSITION.start]
     space = workspace(robot)
     return Features(robot.name, table, labelled_tree(robot, shapes, space.reach), space)
 
 
 def cosine(a: Features, b: Features) -> float:
-    """Return the cosine similarity of the concatenated tokens, in [-1, 1]; 1 for equal robots.
+    """Return the cosine similarity of the tokens, the smaller padded with zeros, in [-1, 1].
 
-    As in AnyBody (arXiv 2505.14986, section 4), joint positions are left out and the smaller robot
-    is padded with zeros.
+    As in AnyBody (arXiv 2505.14986, section 4), joint positions are left out.
     """
     n = min(len(a.tokens), len(b.tokens))
     product = float((a.tokens[:n] * b.tokens[:n]).sum())
@@ -437,10 +430,7 @@ def tree_distance(a: Features, b: Features) -> float:
 
 
 def workspace_overlap(a: Features, b: Features) -> float:
-    """Return the overlap of the tool position densities, in [0, 1]; 1 for equal robots.
-
-    Tool positions are relative to the shoulder and in units of reach.
-    """
+    """Return the overlap of the tool position densities about the shoulders, in [0, 1]."""
     return density_overlap(a.workspace, b.workspace)
 
 
@@ -541,11 +531,7 @@ def classical_mds(distances: ArrayLike) -> MdsMap:
 
 @dataclass(frozen=True)
 class NearThresholds:
-    """Thresholds of near duplicates.
-
-    Two robots are near if their tree distance is small, and either the cosine of their tokens is
-    large or they have one workspace: the same tool positions at the same reach.
-    """
+    """Robots are near by tree distance and either cosine or workspace at the same reach."""
 
     tree: float  # tree distance below which two robots are near
     cosine: float  # cosine of the tokens above which two robots are near

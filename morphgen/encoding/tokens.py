@@ -109,10 +109,7 @@ def require_finite(tokens: Array, what: str, links: Sequence[str]) -> None:
 
 
 def pad_tokens(tokens: Array, max_links: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Pad tokens (..., n_links, 48) with rows of zeros, so that robots of any size share a batch.
-
-    Returns also a mask (max_links,) that is True for links.
-    """
+    """Pad tokens (..., n_links, 48) with zeros; return also a mask (max_links,) of links."""
     n_links = tokens.shape[-2]
     require_max_links(n_links, "the robot", max_links)
     widths = [(0, 0)] * (tokens.ndim - 2) + [(0, max_links - n_links), (0, 0)]
@@ -195,9 +192,8 @@ def tokens(
 ) -> Array:
     """Return the tokens of a robot's links, shape (..., n_links, 48), root first; see ``LAYOUT``.
 
-    shapes: One primitive per link, by link name; links without geometry are absent.
-    q: Independent joint positions, shape (..., dof) [rad or m]; by default the home.
-    max_links: Largest number of links of all compared robots; indices are divided by one less.
+    One primitive per link with geometry; q (..., dof), by default home; ``max_links`` of all
+    robots.
     """
     require_max_links(len(robot.links), f"robot {robot.name!r}", max_links)
     for name in shapes:
@@ -242,9 +238,7 @@ def encode_joint_positions(robot: Robot, q: ArrayLike) -> Array:
 def normalize_positions(robot: Robot, q: ArrayLike) -> Array:
     """Scale the movable joints to -1 at the lower and 1 at the upper limit, shape (..., n_movable).
 
-    Positions of continuous joints, and of revolute ones without limits, are wrapped to (-pi, pi]
-    and divided by pi. Those of prismatic joints without limits stay in metres. Mimic joints follow
-    their leaders. q: Independent joint positions, shape (..., dof) [rad or m].
+    Joints without limits are wrapped and divided by pi; prismatic ones stay in metres.
     """
     joints = [robot.joints[k] for k in robot.movable_joints]
     for joint in joints:

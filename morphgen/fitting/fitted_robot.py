@@ -65,10 +65,7 @@ class Agreement:
 def agreement(
     meshes: Robot, primitives: Robot, n: int = 1000, seed: int = 0
 ) -> tuple[Agreement, Agreement]:
-    """Return how primitives, and convex hulls, agree with meshes on random self-collisions.
-
-    Pairs of links that one of the robots ignores are ignored on both.
-    """
+    """Return how primitives, and convex hulls, agree with meshes on random self-collisions."""
     ignored = {*untested_pairs(meshes), *primitives.ignore_pairs}
     q = random_configurations(meshes, n, np.random.default_rng(seed))
     mesh_collisions = list(_mesh_collisions(meshes, ignored, q))

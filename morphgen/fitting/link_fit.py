@@ -195,10 +195,7 @@ def _frames(z: Array) -> Array:
 
 
 def smallest_ball(points: Array) -> tuple[Array, float]:
-    """Return the centre and radius of the smallest ball around points, shape (n, 2) or (n, 3).
-
-    The farthest point outside is added to the support of a ball until no point is outside.
-    """
+    """Return the centre and radius of the smallest ball around points (n, 2) or (n, 3)."""
     centre, squared_radius, support = points[0], 0.0, points[:1]
     while True:
         squares = np.square(points - centre).sum(axis=1)
@@ -351,12 +348,7 @@ class LinkFit:
 def fit_shapes(
     shapes: Sequence[Shape], options: FitOptions, *, solid: Solid | None = None
 ) -> LinkFit:
-    """Fit the shapes of one link.
-
-    shapes: Shapes in the link frame. They are kept if all are boxes, cylinders or spheres and
-        there are no more than ``max_primitives``; by a fit of spheres, if all are spheres.
-    solid: The solid of the shapes, if it is known already.
-    """
+    """Fit the shapes of one link in its frame, or keep few primitives of the wanted kinds."""
     start = time.perf_counter()
     solid = solid or solid_of(shapes)
     is_kept = are_primitives(shapes) and len(shapes) <= options.max_primitives

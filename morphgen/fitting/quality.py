@@ -136,10 +136,7 @@ def _rounded(*beyond: Array) -> Array:
 
 
 def _bounding_box(primitives: Sequence[Shape], points: Array) -> tuple[Array, Array, Array]:
-    """Return the smallest box around all, along the axes of the link or of a primitive.
-
-    The axes are the columns of the first array; the others are the bounds along them.
-    """
+    """Return axes and bounds of the smallest box around all along the axes of one."""
     boxes = []
     for R in (np.eye(3), *(shape.T_link_shape.matrix[:3, :3] for shape in primitives)):
         centres = np.array([shape.T_link_shape.position for shape in primitives]) @ R

@@ -44,10 +44,9 @@ _ROUGH_TOLERANCE = 30.0
 
 
 def congruence(a: trimesh.Trimesh, b: trimesh.Trimesh, tolerance: float = 1e-4) -> Array | None:
-    """Return ``T_b_a`` (4, 4), the rigid motion or mirroring that maps mesh a to b; None if none.
+    """Return the motion (preferred) or mirroring (4, 4) that maps mesh a to b; None if none.
 
-    Both must have the same numbers of vertices and faces. A motion is preferred to a mirroring. The
-    transform of a rotated body of very high symmetry, such as a sphere, may not be found.
+    Both must have as many vertices and faces. One of a body like a sphere may not be found.
     """
     if a.vertices.shape != b.vertices.shape or a.faces.shape != b.faces.shape:
         return None
@@ -70,10 +69,7 @@ def congruence(a: trimesh.Trimesh, b: trimesh.Trimesh, tolerance: float = 1e-4) 
 
 
 def moved(shape: Shape, T_b_a: Array) -> Shape:
-    """Return a primitive of frame a in frame b, after a rigid motion or a mirroring (4, 4).
-
-    Every primitive is its own mirror image, so mirroring only changes its pose.
-    """
+    """Return a primitive of frame a in frame b after a motion or mirroring, which is the same."""
     if isinstance(shape.geometry, Mesh):
         raise ValueError(f"{shape.geometry} is not a primitive")
     R = T_b_a[:3, :3]
@@ -85,10 +81,7 @@ def moved(shape: Shape, T_b_a: Array) -> Shape:
 
 
 def representatives(meshes: Sequence[trimesh.Trimesh]) -> list[tuple[int, Array]]:
-    """Return for each mesh the index of the first congruent one, and the transform (4, 4) from it.
-
-    It is its own index and the identity if no earlier mesh is congruent to it.
-    """
+    """Return each mesh's first congruent one, perhaps itself, and the transform from it."""
     shared: list[tuple[int, Array]] = []
     for index, mesh in enumerate(meshes):
         firsts = (first for first in range(index) if shared[first][0] == first)
@@ -239,12 +232,7 @@ class FitReport:
 def fit_links(
     robot: Robot, options: FitOptions, *, only: Collection[str] | None = None, jobs: int = 1
 ) -> FitReport:
-    """Fit the collision shapes of every link, or its visuals if it has no collision shapes.
-
-    Congruent links, mirrored ones included, share one fit.
-
-    only: Names of the links to fit; by default all that have shapes.
-    """
+    """Fit the collision shapes, or visuals, of every link or of some; congruent links share one."""
     solids: dict[str, Solid] = {}
     failures: dict[str, FitError] = {}
     links = [
@@ -301,10 +289,7 @@ def _try_fit(options: FitOptions, work: tuple[tuple[Shape, ...], Solid]) -> Link
 
 
 def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manifest]:
-    """Return the parts that have meshes and are no other part at another scale.
-
-    With ``missing``, only those with a link whose fit is not stored.
-    """
+    """Return unscaled parts with meshes; with ``missing``, those whose fits are not all stored."""
     stored = fit_files.read_stored_fits(library.folders) if missing else {}
     return [
         manifest
@@ -337,10 +322,7 @@ def store_part(manifest: Manifest) -> Path:
 
 
 def fits_of(robot: Robot, report: FitReport, stored: StoredFits) -> dict[str, StoredFit]:
-    """Return the fits of a report by link name, each with the primitive of the link's token.
-
-    The token's primitive is the known one if the robot carries it or it is stored.
-    """
+    """Return a report's fits by link, each with the link's token, by preference the known one."""
     fits = {}
     for row in report.links:
         shapes = fit_files.shapes_to_fit(robot.link(row.link))

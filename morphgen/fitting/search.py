@@ -218,10 +218,7 @@ def covered(candidates: Candidates, points: Array) -> NDArray[np.bool_]:
 
 
 def _distances(candidates: Candidates, points: Array) -> NDArray[np.float32]:
-    """Return the distances of points (m, 3) from the nearest primitive of each candidate, (n, m).
-
-    They are negative inside.
-    """
+    """Return distances of points (m, 3) from each candidate, (n, m), negative inside."""
     n, k = candidates.kinds.shape
     x = _homogeneous(points)
     rotations = Rotation.from_quat(candidates.quaternions.reshape(-1, 4), scalar_first=True)
@@ -244,11 +241,9 @@ def _homogeneous(points: Array) -> NDArray[np.float32]:
 def _beyond(
     x: NDArray[np.float32], kinds: NDArray[np.int64], R: Array, centres: Array, halves: Array
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return points (4, m) in the frames of primitives (p, 3, m), and their distances.
+    """Return points (4, m) in the frames of primitives (p, 3, m), and distances beyond their faces.
 
-    Distances are from the planes through the centre, the axis or the centre itself, and beyond the
-    faces. Those in the first two rows of a cylinder, and in all of a sphere, are equal; of spheres
-    alone there is one row.
+    Those in the first two rows of a cylinder are equal; of spheres alone there is one row.
     """
     inverse = R.transpose(0, 2, 1)
     local = np.concatenate([inverse, -inverse @ centres[:, :, None]], axis=2).astype(np.float32) @ x
@@ -290,10 +285,7 @@ def around(points: Array, axes: list[Array], *, sphere: bool = False) -> Candida
 
 
 def by_pieces(cloud: Cloud, k: int, seeds: list[int]) -> Candidates | None:
-    """Return guesses of ``k`` primitives: the best guess around each of ``k`` clusters.
-
-    None if a cluster has too few points in every clustering.
-    """
+    """Return guesses of ``k`` primitives: the best around each of ``k`` clusters; or None."""
     inside, outside = cloud.take(cloud.inside), cloud.take(~cloud.inside)
     rows: list[Candidates] = []
     for seed in seeds:
@@ -305,10 +297,7 @@ def by_pieces(cloud: Cloud, k: int, seeds: list[int]) -> Candidates | None:
 
 
 def by_growth(fewer: Candidates, cloud: Cloud, seed: int) -> Candidates | None:
-    """Return guesses with one more primitive, around a part of the solid that is not covered.
-
-    None if too few points are uncovered.
-    """
+    """Return guesses with one more primitive where the solid is not covered; or None."""
     outside = cloud.take(~cloud.inside)
     missed = cloud.take(cloud.inside & ~covered(fewer, cloud.points)[0])
     rows: list[Candidates] = []
@@ -325,10 +314,7 @@ def by_growth(fewer: Candidates, cloud: Cloud, seed: int) -> Candidates | None:
 
 
 def _best_of_each_kind(piece: Cloud, outside: Cloud) -> Candidates:
-    """Return guesses around a cluster inside the solid: the best, the best box, the best cylinder.
-
-    outside: The points outside the solid.
-    """
+    """Return guesses around a cluster inside the solid: the best, and the best of two kinds."""
     guesses = around(piece.points, [np.eye(3)])
     pairs = zip(vars(piece).values(), vars(outside).values(), strict=True)
     ious = overlaps(guesses, Cloud(*(np.concatenate(pair) for pair in pairs)))
@@ -339,10 +325,7 @@ def _best_of_each_kind(piece: Cloud, outside: Cloud) -> Candidates:
 
 
 def _along(points: Array, R: Array) -> list[tuple[int, Array, Array, Array]]:
-    """Return a box along the axes of ``R`` and a cylinder along each of them.
-
-    Each guess is a kind, a centre, a rotation and half extents.
-    """
+    """Return guesses along the axes of ``R``: a box and three cylinders."""
     low, high = np.quantile(points @ R, (TRIM, 1 - TRIM), axis=0)
     centre, halves = R @ (low + high) / 2, np.maximum((high - low) / 2, _MIN_HALF_EXTENT)
     guesses = [(_BOX, centre, R, halves)]
@@ -355,10 +338,9 @@ def _along(points: Array, R: Array) -> list[tuple[int, Array, Array, Array]]:
 
 @dataclass(frozen=True)
 class SampledSolid(Cloud):
-    """A solid as sample points in the frame and units of its smallest bounding box.
+    """A solid as shuffled sample points in the frame and units of its smallest bounding box.
 
-    In that frame a thin oblique solid is hit by as many points as one along the link's axes. The
-    points are shuffled, and the mean of their weights is 1; sparse points weigh more.
+    There a thin oblique solid is hit by as many points. Sparse ones weigh more; the mean is 1.
     """
 
     solid: Solid
@@ -432,10 +414,7 @@ def best_single(target: SampledSolid) -> SearchResult:
 
 
 def best_several(target: SampledSolid, fewer: SearchResult, seed: int) -> SearchResult | None:
-    """Return the primitives of largest IoU, one more than in an earlier result.
-
-    None if the solid has too few sample points for them.
-    """
+    """Return primitives of largest IoU, one more than in an earlier result; or None."""
     seeds = [int(child) for child in np.random.SeedSequence(seed).generate_state(NUM_CLUSTERINGS)]
     cloud = target.take(slice(4 * COARSE_POINTS))
     starts = (
@@ -466,9 +445,8 @@ def _search(
 ) -> SearchResult:
     """Improve guesses in rounds, and return the best.
 
-    weights: Weights of the points for each guess; by default their volumes.
-    cover: Share of the solid that every candidate is changed to cover before it is counted.
-    judge: Points that the last round is counted on, if others.
+    ``weights`` of points may differ by guess; candidates are changed to ``cover`` a share of the
+    solid; ``judge`` are points that the last round is counted on.
     """
     best = np.arange(len(guesses.kinds))
     for how in rounds:

@@ -203,10 +203,7 @@ def _ragged(counts: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp
 
 
 def solid_of(shapes: Sequence[Shape]) -> Solid:
-    """Return the solid of shapes that are fixed to each other.
-
-    shapes: At least one shape.
-    """
+    """Return the solid of at least one shape, fixed to each other."""
     if not shapes:
         raise FitError("there are no shapes")
     meshes = map(link_frame_mesh, shapes)

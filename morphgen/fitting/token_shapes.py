@@ -384,10 +384,7 @@ def fit_primitive(shapes: Sequence[Shape]) -> Shape | None:
 
 
 def _dominant_primitive(shapes: Sequence[Shape]) -> Shape | None:
-    """Return the primitive to which the other primitives of a link add next to no volume.
-
-    It is in its canonical pose.
-    """
+    """Return the canonical primitive to which a link's others add next to no volume."""
     if not fits.are_primitives(shapes):
         return None
     largest = max(shapes, key=lambda shape: union_volume([shape]))

@@ -69,10 +69,7 @@ def bundle_folder(parent: Path, name: str) -> Path:
 
 
 def require_replaceable(folder: Path) -> None:
-    """Require that a folder does not exist or is an unedited bundle, so that one may replace it.
-
-    The card, the picture and exported files may differ from those that were written.
-    """
+    """Require that a folder does not exist or is a bundle of which only generated files differ."""
     if folder.is_symlink():
         raise FormatError(f"{folder} is a link; choose another name or folder")
     if not folder.exists():

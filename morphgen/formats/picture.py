@@ -83,10 +83,7 @@ def render(
 
 
 def _framing(robot: Robot, q: Array, aspect: float) -> tuple[Array, float]:
-    """Return the closest view that shows the whole robot and its root's origin, centred.
-
-    It is the point (3,) in the root frame that the camera looks at, and its distance from it [m].
-    """
+    """Return centre (3,) and distance [m] of the closest view of the whole robot and its origin."""
     T_root_link = forward_kinematics(robot, q)
     points = [np.zeros((1, 3))]
     for T, link in zip(T_root_link, robot.links, strict=True):

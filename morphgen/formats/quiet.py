@@ -11,10 +11,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Discard what C code prints to stdout and stderr in this block.
-
-    The streams belong to the process, so the output of other threads is discarded, too.
-    """
+    """Discard what C code of any thread prints to stdout and stderr in this block."""
     saved = [os.dup(fd) for fd in (1, 2)]
     sink = os.open(os.devnull, os.O_WRONLY)
     try:

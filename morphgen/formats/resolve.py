@@ -219,10 +219,7 @@ def _package_places(
 
 
 def package_source(file: FoundFile) -> dict[str, str]:
-    """Return ``source`` and ``licence`` of an installed package that a file was found in.
-
-    The source is the pip distribution with its version, else the folder's name.
-    """
+    """Return ``source`` and ``licence`` of an installed package that a file was found in."""
     manifest = file.folder / "package.xml"
     declared = _LICENCE_TAG.search(_manifest_text(manifest)) if manifest.is_file() else None
     licence = declared[1].decode(errors="replace").strip() if declared else ""
@@ -237,10 +234,7 @@ def package_source(file: FoundFile) -> dict[str, str]:
 
 
 def require_allowed_text(path: Path, finder: PackageFinder, *files: Path) -> None:
-    """Require that a xacro may read a text file or list a folder; see docs/importing.md.
-
-    Security: a xacro can copy text into the robot, so it must not read private files.
-    """
+    """Require that a xacro may copy a file into the robot or list a folder: none is private."""
     real = path.resolve()
     if _is_in(real, (*finder.roots, finder.root)):
         return

@@ -19,10 +19,7 @@ _UNKNOWN_LICENCE = "unknown"
 
 
 def ros_package_name(robot_name: str) -> str:
-    """Return the name of a robot's description package, such as ``ur5_plane_description``.
-
-    ROS allows lower-case letters, digits and single underscores, with a letter first.
-    """
+    """Return the name of a description package that ROS allows: ``ur5_plane_description``."""
     words = "_".join(re.findall(r"[a-z0-9]+", robot_name.lower()))
     return f"{words if words[:1].isalpha() else f'robot_{words}'.rstrip('_')}_description"
 
@@ -64,10 +61,7 @@ def write_ros_package(robot: Robot, folder: Path, srdf: str) -> None:
 
 
 def part_licences(card: Mapping[str, object]) -> tuple[str, ...]:
-    """Return the licences of a robot's parts in their order; none for robots without.
-
-    card: Provenance of the robot, or its whole card.
-    """
+    """Return the licences of a robot's parts by its provenance or card; none without parts."""
     parts = card.get("parts")
     rows = parts if isinstance(parts, list) else []
     names = [

@@ -80,10 +80,7 @@ def disabled_link_pairs(root: etree._Element, links: Iterable[str]) -> tuple[Pai
 
 
 def with_disabled_pairs(robot: Robot, root: etree._Element, origin: str = "SRDF") -> Robot:
-    """Return a robot that also ignores the contacts of the pairs that an SRDF disables.
-
-    Links that are frames of the robot have no shapes, so their pairs are left out.
-    """
+    """Return a robot that also ignores contacts of the links that an SRDF disables."""
     frames = {frame.name for frame in robot.frames}
     pairs = disabled_link_pairs(root, robot.link_index)
     for name in dict.fromkeys(link for pair in pairs for link in pair):
@@ -103,10 +100,7 @@ _CUROBO_VERSION = 2.0
 def curobo_text(
     robot: Robot, spheres: Sequence[LinkSpheres], ignored: Iterable[Pair], urdf: str, comment: str
 ) -> str:
-    """Return a robot's configuration for cuRobo (format version 2.0) as YAML.
-
-    Keys that a robot does not determine, such as limits of acceleration, are left to its defaults.
-    """
+    """Return a robot's configuration for cuRobo (format version 2.0) as YAML."""
     require_tool(robot)
     # "tool" of a robot with several limbs is the tool of the last one.
     names = (frame.name for frame in robot.frames)

@@ -53,9 +53,8 @@ def prim_name(prim: Usd.Prim) -> str:
 def _write_poses(stage: Usd.Stage, urdf: Path) -> None:
     """Write the poses of all links and joints from the origins of the URDF's joints.
 
-    urdf-usd-converter 0.3.4 makes matrices of quaternions in single precision, whose angle OpenUSD
-    takes from the cosine of its half: it reads a turn of less than 0.34 mrad as none, and one of
-    0.5 mrad as 0.7. The quaternions themselves are exact enough.
+    urdf-usd-converter 0.3.4 makes quaternions of matrices in single precision: a turn of less than
+    0.34 mrad becomes none, and one of 0.5 mrad 0.7.
     """
     from pxr import Gf, UsdPhysics
 

@@ -93,10 +93,7 @@ def root_tag(data: bytes) -> str | None:
 
 
 def _decoded(data: bytes) -> tuple[str, str, str]:
-    """Return a document's text, its declared encoding, and the one that it was read in.
-
-    That is the declared one, else UTF-8, else Latin-1.
-    """
+    """Return a document's text, its declared encoding, and the one read: that, UTF-8 or Latin-1."""
     if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         return data.decode("utf-16", errors="replace"), "utf-16", "utf-16"
     data = data.removeprefix(codecs.BOM_UTF8)

@@ -168,10 +168,7 @@ def _entry_path(entry: zipfile.ZipInfo, limits: ZipLimits) -> str:
 
 
 def _require_distinct(paths: Sequence[str]) -> None:
-    """Require that no two files have the same path, and no file the path of a folder.
-
-    Case is ignored, because some file systems ignore it.
-    """
+    """Require that no two paths are equal, whatever the case, and none the folder of another."""
     known_paths: set[str] = set()
     for path in paths:
         if path.casefold() in known_paths:

@@ -42,10 +42,9 @@ class SearchError(GrammarError):
 
 
 def count_structures(grammar: Grammar) -> float:
-    """Return the number of structures, or infinity for a recursive grammar.
+    """Return the number of structures, or of derivations if more; infinity if recursive.
 
-    A structure that has two derivations counts twice. The number is exact up to ``MAX_COUNT``;
-    ``MAX_COUNT + 1`` stands for any larger number.
+    It is exact up to ``MAX_COUNT``; ``MAX_COUNT + 1`` stands for any larger number.
     """
     alternatives = _possible_alternatives(grammar)
     counts: dict[str, int] = {}

@@ -30,10 +30,9 @@ FACTS_FILE = Path(__file__).with_name("part_facts.json")
 
 
 def catalogue(library: Library, kind: str | None = None) -> list[dict[str, object]]:
-    """Return a row of facts about every part, or about those of one kind, at default parameters.
+    """Return facts about every part, or those of one kind, at default parameters.
 
-    The reach [m] is the largest distance from the mount to a port or the tool; the mass is in kg.
-    A part that cannot be loaded is left out, and a line says why.
+    The reach [m] is from the mount to a port or the tool. What cannot be loaded is a line.
     """
     stored = stored_facts()
     rows: list[dict[str, object]] = []

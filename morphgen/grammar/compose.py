@@ -45,9 +45,8 @@ def compose(derivation: Derivation, library: Library, name: str) -> Robot:
 def join(derivation: Derivation, library: Library, name: str) -> Robot:
     """Build the robot of a derivation without collision tests.
 
-    A part whose root is an empty link is merged with its parent: everything attached to the root is
-    attached to the parent. The tool is that of the outermost part with a tool, or the first port of
-    the last part.
+    A part whose root is an empty link is merged with its parent. The tool is that of the outermost
+    part with a tool, or the first port of the last part.
     """
     parts = load_parts(derivation, library)
     assembly = _Assembly(parts)
@@ -203,9 +202,8 @@ def _part_provenance(scoped: ScopedPart) -> dict[str, object]:
 def survey_contacts(robot: Robot, derivation: Derivation, library: Library) -> CollisionSurvey:
     """Find the pairs of links of a joined robot whose contacts are ignored.
 
-    Pairs within an unscaled real part are known from the part alone; all other pairs are tested.
-    Parts that penetrate each other at home by more than ``MAX_HOME_OVERLAP`` are not ignored:
-    ``check`` reports such a faulty composition.
+    Pairs within an unscaled real part are known. Parts that penetrate each other at home by more
+    than ``MAX_HOME_OVERLAP`` are not ignored: ``check`` reports such a faulty composition.
     """
     owner: dict[str, str] = {}  # label of the part of each link
     tested: set[str] = set()  # links whose contacts within their own part are not known

@@ -195,10 +195,7 @@ class _Run:
     def _expand(
         self, item: Item, label: str, prefix: str, key: str, depth: int
     ) -> tuple[_Node, _Node]:
-        """Rewrite one item; return its first part and the part that the next item attaches to.
-
-        A single part takes ``label``; several parts take their own names after ``prefix``.
-        """
+        """Rewrite one item; return its first part and the part that the next item attaches to."""
         production = self._grammar.production(item.name)
         if production is None:
             node = self._part(item, label, key)

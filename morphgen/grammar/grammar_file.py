@@ -71,10 +71,7 @@ def find_grammar(name: str, folders: Iterable[Path] = ()) -> Path:
 
 
 def load_grammar(path: Path, folders: Iterable[Path] = ()) -> Grammar:
-    """Read a grammar with its includes.
-
-    A file's symbols and values replace those of the same name in the files that it includes.
-    """
+    """Read a grammar with its includes, whose symbols and values it may replace."""
     reader = _Reader(path, tuple(folders))
     return _build(path.stem, str(path), reader.statements, reader.texts)
 

@@ -26,9 +26,8 @@ from morphgen.grammar.values import Scope, evaluate, typical_value
 def pin(grammar: Grammar, words: Sequence[str], library: Library) -> Grammar:
     """Return the grammar with some of its choices fixed.
 
-    ``symbol=name`` keeps the alternatives of a symbol that begin with a name; ``symbol=5`` fixes
-    the count of its repetition; ``part.parameter=value`` fixes a parameter of every copy of a
-    part; ``name=value`` fixes a value of ``let``.
+    ``symbol=name`` keeps alternatives that begin with a name; ``symbol=5`` fixes a count;
+    ``part.parameter=value`` a parameter of every copy; ``name=value`` a value of ``let``.
     """
     for word in words:
         key, equals, value = word.partition("=")
@@ -158,9 +157,8 @@ class _Slot:
 def parse_words(words: Sequence[str], library: Library) -> tuple[Derivation, str]:
     """Return the derivation that words describe, and a name for its robot.
 
-    The words have one of three forms: ``key=value`` words (see ``parse_request``); the name of a
-    grammar and pinned choices (see ``morphgen.grammar.request.pin``), which give its first
-    alternatives, smallest counts and typical values; or parts joined by dashes, each of which
+    The words are ``key=value`` (see ``parse_request``); a grammar and choices of ``pin``, with its
+    first alternatives, smallest counts and typical values; or parts joined by dashes, each of which
     takes the slot of its kind: ``ur5-plane`` is ``arm=ur5 ee=plane``.
     """
     if not words:

@@ -309,10 +309,7 @@ def make_in_processes(jobs: int = 1) -> SetWorker:
 
 
 def make_on_ray(address: str | None) -> SetWorker:
-    """Return a worker that makes robots on the Ray cluster at an address, or on a local Ray.
-
-    The machines of the cluster need morphgen and share the set's folder.
-    """
+    """Return a worker that makes robots on a Ray cluster that shares the set's folder."""
     ray = require_ray()
 
     def work(config: SetConfig, indices: Sequence[int]) -> Iterator[Record]:

@@ -45,13 +45,11 @@ def find_robots(
     library: Library,
     refuse: Callable[[str, FormatError], object] | None = None,
 ) -> list[RobotReference]:
-    """Return the robots that the words of a command line name, without reading them.
+    """Return the robots that the words of a command line name, once each, without reading them.
 
-    Each word is one of: a bundle's folder, a URDF, a xacro or an MJCF; a set of ``morphgen sample``
-    or a folder of bundles, which stand for all their robots; parts joined by dashes, such as
-    ``ur5-plane``. Neighbouring words of the form ``key=value`` are one robot together, as in
-    ``arm=ur5 ee=plane``; a grammar's name also begins a robot: ``chain beads=5``. A word with
-    spaces is a request of its own. Each robot is returned once.
+    Each word is a bundle's folder, a description, a set or folder of bundles, which stand for all
+    their robots, or parts joined by dashes. Neighbouring words ``key=value`` are one robot
+    together, also after a grammar's name. A word with spaces is a request of its own.
     """
     if not words:
         raise CompositionError("no robot is named; expected one such as ur5-plane or robots/arm3")

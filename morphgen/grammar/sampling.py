@@ -56,10 +56,7 @@ class Sample:
 def sample_robots(
     grammar: Grammar, library: Library, n: int, *, seed: int = 0, where: Sequence[Expression] = ()
 ) -> Iterator[Sample]:
-    """Draw robots one after the other.
-
-    Robot i does not depend on n: its generator is child i of ``SeedSequence(seed)``.
-    """
+    """Draw robots; generator i is child i of ``SeedSequence(seed)``, whatever n."""
     for index in range(n):
         yield sample_robot(grammar, library, index, seed=seed, where=where)
 

@@ -54,10 +54,7 @@ class Actuation:
 
 
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
-    """Return the joint-space inertia at one configuration (dof,), symmetric, shape (dof, dof).
-
-    Mimic joints are folded into their leaders.
-    """
+    """Return the joint-space inertia (dof, dof) at q (dof,), mimic joints in their leaders."""
     matrix, _ = robot.mimic_map
     return np.asarray(matrix.T @ movable_mass_matrix(robot, q) @ matrix)
 
@@ -101,10 +98,7 @@ def _motions_of_masses(
 
 
 def armature(robot: Robot) -> Array:
-    """Return the inertia that motors and linkages add to joints, (n_movable,) [kg m^2 or kg].
-
-    See ``actuation``.
-    """
+    """Return the inertia that motors add to joints (n_movable,) [kg m^2 or kg]: ``actuation``."""
     return _inertias(robot)[1]
 
 

@@ -141,10 +141,7 @@ def solid_mesh(geometry: Geometry) -> trimesh.Trimesh:
 
 
 def solid_triangles(geometry: Geometry) -> Triangles:
-    """Return the triangles of a mesh file, or those of ``solid_mesh`` for a primitive.
-
-    Spheres differ from those of ``solid_mesh`` by rounding.
-    """
+    """Return triangles of a mesh file or of a primitive; spheres differ from ``solid_mesh``."""
     if isinstance(geometry, Mesh):
         return mesh_triangles(geometry)
     if isinstance(geometry, Capsule):
@@ -176,10 +173,7 @@ def link_frame_mesh(shape: Shape) -> trimesh.Trimesh:
 
 
 def bounding_box(shapes: Sequence[Shape]) -> Array:
-    """Return the axis-aligned bounds of shapes in the link frame, shape (2, 3) [m].
-
-    Cached until a mesh file changes; read-only.
-    """
+    """Return kept, read-only bounds of shapes in the link frame, shape (2, 3) [m]."""
     return _bounding_box(*_cache_key(shapes))
 
 

@@ -23,10 +23,7 @@ from morphgen.typing import Array
 
 
 def joint_limits(robot: Robot) -> Array:
-    """Return the lower and upper limits of the independent joints, shape (dof, 2) [rad or m].
-
-    Joints without limits get (-pi, pi) and, if prismatic, (-1, 1).
-    """
+    """Return limits (dof, 2) of independent joints [rad or m]; (-pi, pi) or (-1, 1) if none."""
     joints = [robot.joints[k] for k in robot.independent_joints]
     return np.array([joint.effective_limits for joint in joints]).reshape(-1, 2)
 
@@ -45,10 +42,7 @@ def driving_joints(robot: Robot, joints: Iterable[int]) -> tuple[int, ...]:
 
 
 def periodic_joints(robot: Robot) -> NDArray[np.bool_]:
-    """Return which independent joints may turn by 2 pi without moving any link, shape (dof,).
-
-    These are the rotational joints without mimic joints that follow them.
-    """
+    """Return which joints (dof,) turn by 2 pi without moving a link: without mimic joints."""
     has_followers = (robot.mimic_map[0] != 0).sum(axis=0) > 1
     kinds = np.array([robot.joints[k].kind for k in robot.independent_joints])
     return np.asarray(np.isin(kinds, ("revolute", "continuous")) & ~has_followers)
@@ -69,10 +63,7 @@ def unwrap_joints(robot: Robot, q_reference: ArrayLike, q: ArrayLike) -> Array:
 
 
 def movable_positions(robot: Robot, q: ArrayLike) -> Array:
-    """Return the positions of all movable joints, mimic joints following their leaders.
-
-    They are in the order of ``robot.movable_joints``, shape (..., n_movable) [rad or m].
-    """
+    """Return positions of ``robot.movable_joints`` (..., n_movable), mimic joints following."""
     q = np.asarray(q, dtype=np.float64)
     if q.shape[-1:] != (robot.dof,):
         raise ValueError(f"q has shape {q.shape}; {robot.name} needs (..., {robot.dof})")
@@ -144,10 +135,7 @@ def frame_jacobian(robot: Robot, q: ArrayLike, frame: str = TOOL) -> tuple[Array
 
 
 def moving_chain(robot: Robot, frame: str) -> tuple[list[tuple[int, Array]], Array]:
-    """Return the movable joints before a frame, root first, and the transform behind the last.
-
-    Each joint has its index and the constant transform (4, 4) from the joint before it.
-    """
+    """Return joints that move a frame with transforms from the one before, and the last."""
     target, T = robot.frame(frame), np.eye(4)
     movable: list[tuple[int, Array]] = []
     for k in robot.joint_chain(target.link):
@@ -211,10 +199,7 @@ def reach(robot: Robot, frame: str = TOOL, samples: int = 256, rounds: int = 6) 
 
 
 def arm_reach(robot: Robot) -> float:
-    """Return the largest distance between the tool and the origin of the first joint that moves it.
-
-    Unlike ``reach``, it does not depend on where the robot is mounted [m].
-    """
+    """Return the largest distance of the tool from the first joint that moves it [m]."""
     T_root_joint = IDENTITY
     for k in robot.joint_chain(robot.frame(TOOL).link):
         T_root_joint = T_root_joint @ robot.joints[k].T_parent_joint
@@ -224,10 +209,7 @@ def arm_reach(robot: Robot) -> float:
 
 
 def with_root_at(robot: Robot, point: Vec3) -> Robot:
-    """Return the robot with the origin of its root frame at a point of it, for distances from it.
-
-    Shapes and inertia of the root stay where they are in its frame.
-    """
+    """Return the robot with its root frame's origin at a point, its shapes where they are."""
     T_point_root = Pose(point).inverse()
     return replace(
         robot,

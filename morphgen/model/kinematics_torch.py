@@ -68,10 +68,7 @@ def skew(v: torch.Tensor) -> torch.Tensor:
 
 
 def rotation_from_z(axes: torch.Tensor) -> torch.Tensor:
-    """Return the smallest rotations that turn z into unit vectors (..., 3), shape (..., 3, 3).
-
-    For the opposite of z it is half a turn about x.
-    """
+    """Return the smallest rotations (..., 3, 3) that turn z into unit vectors (..., 3)."""
     z = torch.zeros_like(axes)
     z[..., 2] = 1
     cross, cosine = torch.linalg.cross(z, axes), axes[..., 2]

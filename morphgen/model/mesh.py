@@ -72,10 +72,7 @@ def require_bounded_files(paths: Iterable[Path], origin: str) -> None:
 
 
 def require_bounded_meshes(robot: Robot) -> None:
-    """Require that the meshes of a robot have few enough triangles, and pixels of textures.
-
-    Files are read until the bound is passed. What cannot be read is left to others.
-    """
+    """Require few enough triangles and pixels, read until there are too many."""
     origin, faces, pixels = f"robot {robot.name!r}", 0, 0
     shapes = (shape for link in robot.links for shape in (*link.visuals, *link.collisions))
     meshes = (shape.geometry for shape in shapes if isinstance(shape.geometry, Mesh))

@@ -69,10 +69,7 @@ def to_matrix(q: Quat) -> tuple[Vec3, Vec3, Vec3]:
 
 
 def from_matrix(rows: tuple[Vec3, Vec3, Vec3]) -> Quat:
-    """Return the quaternion of a rotation matrix, given as rows.
-
-    Shepperd, Quaternion from rotation matrix, 1978: the largest of four pivots is used.
-    """
+    """Return the quaternion of a rotation matrix, given as rows (Shepperd, 1978)."""
     (a, b, c), (d, e, f), (g, h, i) = rows
     trace = a + e + i
     pivots = (trace, a, e, i)

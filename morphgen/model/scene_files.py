@@ -93,10 +93,7 @@ def read_picture(source: bytes | Path) -> Image.Image:
 
 
 class FolderResolver(trimesh.resolvers.Resolver):
-    """Resolves the file names in a mesh file, within the mesh's own folder only.
-
-    It also collects what a reader leaves out of the file.
-    """
+    """Resolves names within a mesh file's folder only; collects what is left out of the file."""
 
     def __init__(self, folder: Path) -> None:
         """Restrict access to a folder and the folders below it."""

@@ -240,10 +240,7 @@ def split_paths(out: Path, splits: Sequence[Split]) -> list[Path]:
 
 
 def write_new_splits(splits: Sequence[Split], paths: Sequence[Path]) -> None:
-    """Write all files, or none if one of them exists with another content.
-
-    A file of the same content that another version of morphgen wrote is kept.
-    """
+    """Write all files, or none if one exists with another content, apart from versions."""
     missing = []
     for split, path in zip(splits, paths, strict=True):
         if not path.is_file():

@@ -129,8 +129,7 @@ def _accept_browsers(viewer: Viewer) -> None:
 def _receive(viewer: Viewer, token: str, query: str) -> bool:
     """Handle a request of a page's script; return whether the browser is connected.
 
-    The query has an action with its value: ``open`` replaces the page by that of an address, others
-    are of the page or the tray. Then it has the page's number, the theme and the window's width.
+    Its query has an action (``open`` replaces the page), the page's number, theme and width.
     """
     # The token is secret: only the script of a page can change what its browser shows.
     session, fields = viewer.sessions.get(token), parse_qsl(query, keep_blank_values=True)

@@ -66,10 +66,7 @@ def call(function: str, *arguments: object) -> str:
 
 
 def page_links(address: Address, chosen: Sequence[str]) -> dict[str, Address]:
-    """Return the addresses of the links in the top bar by their labels.
-
-    A link keeps what the current page is about; *Compare* and *Playback* take the chosen robots.
-    """
+    """Return the top bar's links by label; each keeps what the current page is about."""
     uri = address.subject if address.page in ("robot", "compare") else ""
     robots = tuple(chosen) or ((uri,) if uri else ())
     folder, split = _surroundings(address)

@@ -99,10 +99,7 @@ def content_security_policy(policy: AccessPolicy, host: str) -> str:
 
 
 def _is_viewer_name(policy: AccessPolicy, netloc: str) -> bool:
-    """Return whether a host with its port names this viewer.
-
-    The port is not compared, because a tunnel (``ssh -L``) may use another one.
-    """
+    """Return whether a host names this viewer, at any port, because of tunnels (``ssh -L``)."""
     url = _split_url(f"http://{netloc}")
     if url is None or url.username is not None or url.netloc != netloc or not url.hostname:
         return False
@@ -373,10 +370,7 @@ def stop_server(server: viser.ViserServer) -> None:
 
 @contextlib.contextmanager
 def _guarded(policy: AccessPolicy, receive: Receive) -> Iterator[None]:
-    """Apply the policy to the websockets server that viser starts meanwhile.
-
-    viser passes no options to ``websockets.serve``, so the function itself is replaced.
-    """
+    """Apply the policy to the server that viser starts meanwhile: its function is replaced."""
     module = websockets.asyncio.server
     original, started = module.serve, []
 

@@ -148,10 +148,7 @@ class Session:
         timer.start()
 
     def on_change(self, handle: Any, work: Work, key: str = "") -> None:  # noqa: ANN401
-        """Enqueue work whenever the user changes or clicks a control.
-
-        Values that the server itself assigns to the control do not count.
-        """
+        """Enqueue work whenever the user, not the server, changes or clicks a control."""
 
         async def changed(event: viser.GuiEvent[Any]) -> None:
             if event.client is not None:
@@ -254,10 +251,7 @@ class Session:
         return {key: write() for key, (write, _) in self.values.items()}
 
     def apply_state(self) -> None:
-        """Take over the state that the page's address has, in the order of ``keep``.
-
-        A note says which values the page cannot have.
-        """
+        """Take over the address's state in the order of ``keep``; note what cannot be."""
         asked = self.address.state  # a new value may show the state, which changes the address
         for key, (_, apply) in list(self.values.items()):
             if key in asked and apply is not None:

@@ -44,10 +44,7 @@ def scene_server() -> Iterator[viser.ViserServer]:
 
 
 def robot_page(robot: Robot, dark: bool = False) -> bytes:
-    """Return a web page with a robot whose joints move through their ranges, one after the other.
-
-    The page has a slider for the time, and stops with the space bar.
-    """
+    """Return a web page of a robot that moves its joints in turn, with slider and space bar."""
     robot = split_colours(robot)
     low, high = robot_bounds(robot)
     with scene_server() as server:

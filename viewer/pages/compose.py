@@ -97,8 +97,7 @@ def kind_of(slot: str) -> PartKind:
 def slots_of(words: Words, library: Library) -> list[str]:
     """Return the slots that the chosen parts offer, except the base's own slot.
 
-    Every port of the base takes an arm with an end-effector on each of the arm's ports. Beside a
-    main arm, an end-effector on another port of the base needs an arm there.
+    Beside a main arm, an end-effector on another port of the base needs an arm there.
     """
     base = library.manifest(words["base"], "base")
     arm = words.get("arm")
@@ -142,8 +141,7 @@ def words_of(derivation: Derivation, library: Library) -> Words | None:
 def with_word(words: Words, key: str, value: str, library: Library) -> Words:
     """Return words with another value of a key, or without the key if the value is empty.
 
-    A slot loses the parameters of its previous part; slots and parameters that the chosen parts no
-    longer have are left out.
+    Parameters of a slot's previous part go, as do slots that parts no longer have.
     """
     words = {other: text for other, text in {**words, key: value}.items() if text}
     slots = {"base", *slots_of(words, library)}
@@ -629,10 +627,7 @@ class ComposeView:
         self._count = 0  # number of robots shown so far; names the nodes of the scene
 
     def replace_robot(self, robot: Robot) -> str:
-        """Show a robot; the one before becomes the ghost, unless both belong to one gesture.
-
-        Return what changed from the ghost to the robot; an empty text if there is no ghost.
-        """
+        """Show a robot, and the one before as ghost; return what changed, or an empty text."""
         client, previous, robot = self._session.client, self._shown, split_colours(robot)
         is_gesture = time.monotonic() - self._changed_at < GESTURE_TIME
         with client.atomic():

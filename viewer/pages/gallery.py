@@ -264,10 +264,7 @@ def load_bundle_pictures(gallery: Gallery, rows: Iterable[robot_rows.Row]) -> No
 def load_pictures(
     gallery: Gallery, rows: Sequence[robot_rows.Row], is_wanted: Callable[[], bool] = lambda: True
 ) -> None:
-    """Load or draw the pictures that rows lack while they are wanted.
-
-    If a worker dies, they are requested once more.
-    """
+    """Load or draw pictures that rows lack and want; again, once, if a worker dies."""
     load_bundle_pictures(gallery, rows)
     try:
         _request_missing(gallery, rows, is_wanted)

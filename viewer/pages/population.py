@@ -335,10 +335,7 @@ def load_population(
 def read_robots(
     rows: Sequence[Row], files: robot_uri.FileAccess, grammar_name: str = "", seed: int = 0
 ) -> list[ReadRobot | tuple[str, str]]:
-    """Read or sample robots and measure what their rows lack, or return name and error of each.
-
-    Runs in a worker.
-    """
+    """In a worker, read or sample robots and measure them, or return name and error of each."""
     grammar = robot_uri.resolve_grammar(grammar_name, files) if grammar_name else None
     results: list[ReadRobot | tuple[str, str]] = []
     for row in rows:
@@ -396,8 +393,7 @@ def arrange(population: Population, fact: str = "") -> tuple[Array, Labels]:
 def _rows_of(bounds: Array) -> tuple[Array, list[int]]:
     """Return a place (n, 2) [m] for each robot, like words of a text, and each row's first robot.
 
-    A robot takes its own width, and a row the depth of most of its robots, so that few large
-    robots do not make the others small.
+    A row takes the depth of most of its robots, so that few large ones do not shrink others.
     """
     size = np.maximum(bounds[:, 1] - bounds[:, 0], 0.01)
     slot = size[:, 0] + _WORD_GAP * np.median(size[:, 0])

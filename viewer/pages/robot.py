@@ -347,10 +347,7 @@ class _LinkDrag:
 
 
 def turn_towards(robot: Robot, q: Array, row: int, link: int, point: Array, target: Array) -> Array:
-    """Return a configuration (dof,) in which a point of a link is as near as possible to a target.
-
-    The point is in the link's frame, the target in the root frame, shape (3,) each [m].
-    """
+    """Return q (dof,) where a point of a link (its frame) is near a target (root frame) [m]."""
     q, (low, high) = q.copy(), kinematics.joint_limits(robot)[row]
     column = robot.mimic_map[0][:, row]
     for _ in range(_DRAG_ROUNDS):

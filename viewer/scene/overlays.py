@@ -41,10 +41,7 @@ def sample_workspace(robot: Robot) -> Array:
 
 
 def shell(points: Array) -> Triangles:
-    """Return the outermost of positions (n, 3) [m] by direction from their middle.
-
-    Directions without positions have no faces.
-    """
+    """Return the outermost of positions (n, 3) [m] by direction, with faces between them."""
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     ball = trimesh.creation.icosphere(subdivisions=_SHELL_SUBDIVISIONS)
     length = np.linalg.norm(points - middle, axis=1)
@@ -291,10 +288,7 @@ def show_range(view: RobotView, index: int | None) -> None:
 
 
 def range_lines(joint: Joint, size: float, direction: Vec3) -> tuple[Array, Array, Array]:
-    """Return lines (n, 2, 3) [m] of a needle in the child's frame, and of a joint's range and axis.
-
-    These two are in the joint's frame at position zero. ``size`` is the radius of the arc [m].
-    """
+    """Return lines [m] of a needle in the child's frame, and of range and axis in the joint's."""
     axis, side = np.array(joint.unit_axis), np.array(direction)
     low, high = joint.effective_limits
     axis_line = np.array([[-size * axis, size * axis]])
@@ -314,10 +308,7 @@ def range_lines(joint: Joint, size: float, direction: Vec3) -> tuple[Array, Arra
 
 
 def _needle_direction(view: RobotView, index: int) -> Vec3:
-    """Return a direction perpendicular to a joint's axis that points out of its child link.
-
-    It is also perpendicular to the direction in which the child extends, which hides lines.
-    """
+    """Return a direction across a joint's axis and the child's extent, which would hide lines."""
     robot, axis = view.robot, np.array(view.robot.joints[index].unit_axis)
     child = index + 1
     candidates = [

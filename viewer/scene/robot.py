@@ -74,10 +74,7 @@ class RobotView:
     def show_shapes(
         self, layer: Layer, shapes: Sequence[Sequence[Shape]], growth: float = 0.0
     ) -> None:
-        """Draw shapes, given by link, in place of a layer's previous ones.
-
-        Surfaces are moved outwards by ``growth`` [m], so that they do not coincide with others.
-        """
+        """Draw shapes by link in place of a layer's, grown [m] so that none coincide."""
         self.remove_layer(layer)
         self.layers[layer] = [
             [

@@ -45,10 +45,7 @@ def batch_colours(colours: ArrayLike) -> NDArray[np.uint8]:
 
 
 def triangles(geometry: Geometry) -> Triangles:
-    """Return the surface of a geometry in its own frame.
-
-    Vertices at sharp edges are doubled, so that the browser shades them as edges.
-    """
+    """Return the surface of a geometry, with double vertices at edges that are to look sharp."""
     if isinstance(geometry, Mesh):
         return _mesh_triangles(geometry, load_mesh(geometry))
     return _primitive_triangles(geometry)
@@ -68,8 +65,7 @@ def grown_triangles(geometry: Geometry, thickness: float) -> Triangles:
 def inertia_box(inertial: Inertial) -> tuple[Array, Array] | None:
     """Return the sides (3,) [m] of the solid box with a link's mass and inertia, and its axes.
 
-    The axes are columns (3, 3) in the link frame. None for a massless link, or if no rigid body has
-    such an inertia.
+    They are columns in the link frame. None if no rigid body has such an inertia.
     """
     if inertial.mass <= 0:
         return None
@@ -218,8 +214,7 @@ def look_at(
 ) -> None:
     """Point a browser's camera at a box, from a direction and so near that it just is in view.
 
-    If panels open or close beside the scene, the camera is placed again, unless the user has moved
-    it.
+    It is placed again when panels open, unless the user has moved it.
     """
     placement = _Placement(low, high, direction)
     placement.place(client.camera)
@@ -313,10 +308,7 @@ def camera_view(client: viser.ClientHandle) -> View:
 
 
 def project_points(view: View, points: Array) -> tuple[Array, Array]:
-    """Return where points (..., 3) of the world are in the picture (..., 2), and their depths [m].
-
-    Points behind the camera have a depth below 0 and meaningless coordinates.
-    """
+    """Return where points (..., 3) are in the picture (..., 2), and depths [m], < 0 behind."""
     local = (points - view.position) @ view.R_world_camera
     depth = local[..., 2]
     focal = 0.5 / np.tan(view.fov / 2)

@@ -63,10 +63,7 @@ def replay_submission(
     checkpoint: Path | None = None,
     library: tuple[Path, ...] = (),
 ) -> Iterator[ReplayedEpisode]:
-    """Run random episodes of a submission that was checked again; all if there are no more.
-
-    The policy is that of the checkpoint, or has the name of the method.
-    """
+    """Run random episodes of a submission again with a checkpoint, or the method of its name."""
     interface = Interface()
     controller: Baseline | tuple[dict[str, Any], Mode]
     if checkpoint is None and not submission.mode:

@@ -112,10 +112,7 @@ def method_rows(
     random: RandomScores | None = None,
     source: Source = "submission",
 ) -> list[Row]:
-    """Return a row for each method, from the submissions of all its training seeds.
-
-    Submissions of one seed are of different policies with one name: each is a row of its own.
-    """
+    """Return a row for each method, or for each of several policies with one name and seed."""
     groups: dict[Any, list[Submission]] = {}
     for each in submissions:
         robots = frozenset((robot.side, robot.robot) for robot in each.robots)
@@ -176,10 +173,7 @@ def smallest_differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def floor(submissions: Sequence[Submission]) -> dict[str, dict[str, float]]:
-    """Return the success rate on the test robots of ``zero`` and ``random``, by task and name.
-
-    That of ``random`` is in every submission; that of ``zero`` needs a submission of it.
-    """
+    """Return the success rate on the test robots of ``zero`` and ``random``, by task and name."""
     rates: dict[str, dict[str, float]] = {}
     for name in (ZERO.name, RANDOM):
         own = next((each for each in submissions if _is_baseline(each, name)), None)
@@ -198,11 +192,10 @@ def random_scores(submission: Submission) -> RandomScores:
 
 
 def ranked(rows: Sequence[Row]) -> list[Row]:
-    """Return rows by their result on the test robots, the best first.
+    """Return rows by their mean score on the test robots, the best first.
 
-    It is the mean score if the test robots have one task; scores of different tasks cannot be
-    added, so with several tasks it is the mean success rate. Rows without all of these tasks come
-    last.
+    Scores of different tasks cannot be added: with several it is the success rate. Rows without all
+    of these tasks come last.
     """
     tasks = {task for row in rows for side, task in row.sides if side == "test"}
 

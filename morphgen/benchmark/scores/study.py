@@ -131,11 +131,7 @@ def agent_cell(
 
 
 def matched_budget(config: RunConfig) -> RunConfig:
-    """Return a run on test robots with the budget per robot of the same run on train robots.
-
-    The budget is the number of environments and timesteps. Runs on train robots do not change, nor
-    do runs with ``full_budget``.
-    """
+    """Return a run on test robots with the budget of environments and timesteps per train robot."""
     if side_of(config.source) == "train" or config.full_budget:
         return config
     num_test = len(members(config.source))
@@ -280,8 +276,7 @@ def run_cells(
 ) -> Iterator[Outcome]:
     """Train and evaluate cells one after another, and yield their outcomes.
 
-    Other processes may work on the same cells. Each cell is done by one process; this one waits at
-    the end for the cells of the others.
+    Each is done by one process; this one waits at the end for the cells of others.
     """
     waiting, skipped = deque(cells), 0
     while waiting:
@@ -301,10 +296,7 @@ def run_cells(
 def run_cells_on_ray(
     cells: Sequence[Cell], execution: ExecutionConfig, address: str | None, *, gpus: float = 0.0
 ) -> Iterator[Outcome]:
-    """Train and evaluate cells as tasks of a Ray cluster, and yield their outcomes.
-
-    Its machines have morphgen installed and share the study's folder.
-    """
+    """Train and evaluate cells on a Ray cluster that shares the folder; yield their outcomes."""
     ray = require_ray()
     with ray_cluster(address):
         remote = ray.remote(num_cpus=execution.workers, num_gpus=gpus, max_retries=0)(_on_ray)

@@ -178,10 +178,7 @@ def read_submission(path: Path) -> Submission:
 
 
 def submission_from(data: object, where: Path | str) -> Submission:
-    """Return the submission of a JSON file's content, and check its form and its SHA-256.
-
-    Files of morphgen 0.3 have none.
-    """
+    """Return the submission of a JSON file; its form and SHA-256 (if any) are checked."""
     if isinstance(data, dict) and DIGEST in data:
         data = dict(data)
         if (stored := data.pop(DIGEST)) != (found := content_digest(data)):
@@ -499,10 +496,7 @@ def _flags(cell: str, episodes: int) -> list[bool]:
 
 
 def read_submissions(paths: Sequence[Path]) -> dict[str, Submission]:
-    """Return the submissions in files and below folders: JSON files, and tables of studies.
-
-    Keys are the path of the file, and in a table the split, method, seed and mode.
-    """
+    """Return submissions in files, folders and tables of studies, by path or row."""
     found: dict[str, Submission] = {}
     for path in paths:
         before = len(found)

@@ -168,18 +168,14 @@ _MAX_STEM = 60  # longest file name of a kept mesh, without its suffix [characte
 
 
 def ellipsoid_mesh(radii: Vec3) -> Mesh:
-    """Return a convex mesh of the volume of an ellipsoid: a subdivided icosahedron, scaled.
-
-    radii: Along x, y and z [m].
-    """
+    """Return a convex mesh of an ellipsoid's volume, a scaled icosphere; radii (3,) [m]."""
     return Mesh(_keep("ellipsoid", _unit_sphere()), radii)
 
 
 def inline_meshes(spec: mujoco.MjSpec, document: MjcfDocument) -> dict[str, Path]:
     """Return files of the meshes whose vertices are in the document, by the asset's name.
 
-    A file has the vertices as written, before MuJoCo's scale and reference pose; without triangles,
-    those of their convex hull, as in MuJoCo.
+    They are as written, before scale and pose; without triangles, those of their convex hull.
     """
     files = {}
     for asset in spec.meshes:
@@ -838,10 +834,7 @@ def _ref(model: mujoco.MjModel, joint: int) -> float:
 
 
 def _efforts(model: mujoco.MjModel) -> dict[int, float]:
-    """Return the effort limits by joint [N m or N]; see docs/importing.md.
-
-    A joint has no effort limit if one of its actuators has none.
-    """
+    """Return the effort limits by joint [N m or N], where every actuator has one."""
     efforts: dict[int, float] = {}
     unlimited = set()
     for k in range(len(model.actuator_trntype)):

@@ -170,10 +170,7 @@ def mjcf_text(robot: Robot, mesh_file: MeshFile) -> str:
 
 
 def to_spec(robot: Robot) -> mujoco.MjSpec:
-    """Build an editable MuJoCo model, equal to what ``mjcf_text`` writes.
-
-    It has the triangles of the meshes, for collision shapes those of the convex hull.
-    """
+    """Build an editable MuJoCo model, equal to what ``mjcf_text`` writes, with triangles."""
     meshes = Meshes()
     spec = mujoco.MjSpec.from_string(etree.tostring(_document(robot, meshes), encoding="unicode"))
     meshes.add_to(spec)

@@ -349,10 +349,7 @@ def _joint(element: etree._Element) -> Joint:
 def _named_colours(
     root: etree._Element, origin: str
 ) -> tuple[dict[str, Rgba | None], list[Finding]]:
-    """Return the colours of materials by name, and a finding about names without a material.
-
-    The robot's own materials come first, then those that the shapes of any link define.
-    """
+    """Return the colours of materials, the robot's own first, and a finding about unknown ones."""
     colours = {m.get("name", ""): _colour(m) for m in root.iterfind("material")}
     used = root.findall("link/visual/material")
     for material in used:

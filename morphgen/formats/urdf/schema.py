@@ -35,10 +35,7 @@ _WITH_COMMAS = ("size", "scale")  # attributes that MuJoCo alone refuses with co
 
 
 def _finding(element: etree._Element, row: str, owner: str = "", **values: Any) -> Finding:  # noqa: ANN401
-    """Return the finding of a row of ``findings.yaml`` at an element's line.
-
-    It names the link, joint or other top-level element that contains the element.
-    """
+    """Return the finding of a row at an element's line, with the link or joint around it."""
     top = [element, *element.iterancestors()][-2:][0]
     name = top.get("name")
     owner = owner or (f"{top.tag} {shortened(name)!r}" if name else f"{top.tag} without a name")

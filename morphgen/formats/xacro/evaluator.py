@@ -48,10 +48,7 @@ class Function:
 
 
 def size_of(value: object) -> int:
-    """Count the characters and entries of a value, nested ones included.
-
-    This is the work of copying or printing it.
-    """
+    """Count the characters and entries of a value, the work of copying or printing it."""
     size = 0
     pending = [value]
     while pending:
@@ -531,10 +528,7 @@ def expression(text: str) -> Expression:
 
 
 def evaluate_number(text: str, values: Mapping[str, float]) -> float:
-    """Return the number that an expression is, such as ``length / 2``.
-
-    It may use xacro's functions (``pi``, ``sin``, ``max``, ``radians``, ...).
-    """
+    """Return the number that an expression with xacro's functions is, such as ``length / 2``."""
     try:
         result = expression(text.strip()).evaluate(NAMES, values)
         number = math.nan
