@@ -34,7 +34,7 @@ _READ_CHILDREN = {
 _WITH_COMMAS = ("size", "scale")  # attributes that MuJoCo alone refuses with commas
 
 
-def _finding(element: etree._Element, row: str, owner: str = "", **values: Any) -> Finding:  # noqa: ANN401
+def _finding(element: etree._Element, row: str, owner: str = "", /, **values: Any) -> Finding:  # noqa: ANN401
     """Return the finding of a row at an element's line, with the link or joint around it."""
     top = [element, *element.iterancestors()][-2:][0]
     name = top.get("name")
@@ -323,9 +323,8 @@ def _tree(links: Sequence[etree._Element], joints: Sequence[etree._Element]) -> 
         if not child or child not in by_name:
             continue
         if child in joint_above:
-            other = joint_above[child]
-            values = {"child": child, "other": other.get("name"), "line": other.sourceline}
-            yield _finding(joint, "link-two-parents", **values)
+            other, line = joint_above[child].get("name"), joint_above[child].sourceline
+            yield _finding(joint, "link-two-parents", child=child, other=other, line=line)
             continue
         joint_above[child] = joint
         if parent in by_name:
