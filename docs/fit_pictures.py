@@ -25,12 +25,11 @@ import morphgen
 from morphgen.fitting.link_fit import FitOptions
 from morphgen.fitting.replace_collision import stored_primitives, with_primitives
 from morphgen.fitting.robot_fit import COLLISION_OPTIONS, fit_links
-from morphgen.formats.bundle import MJCF, URDF, split_colours, write_bundle
+from morphgen.formats.bundle import MJCF, split_colours, write_bundle
 from morphgen.formats.fits import are_primitives, read_stored_fits, shapes_key
 from morphgen.formats.picture import render
 from morphgen.grammar.library import Library, default_library
-from morphgen.model.geometry import Mesh, Rgba, Shape
-from morphgen.model.inertia import solid_mesh
+from morphgen.model.geometry import Rgba, Shape
 from morphgen.model.robot import Robot
 
 SIZE = (900, 450)
@@ -146,23 +145,10 @@ def _halves(left: Robot, right: Robot, size: tuple[int, int]) -> list[Image.Imag
     )
     pictures = []
     with tempfile.TemporaryDirectory() as scratch:
-        for i, robot in enumerate((left, _meshed(right, Path(scratch)))):
+        for i, robot in enumerate((left, right)):
             folder = write_bundle(split_colours(robot), Path(scratch) / str(i), picture=False)
-            pictures.append(render(framed, folder / URDF, folder / MJCF, size=size))
+            pictures.append(render(framed, folder / MJCF, size=size))
     return pictures
-
-
-def _meshed(robot: Robot, scratch: Path) -> Robot:
-    """Replace visual primitives by fine meshes, because PyBullet draws primitives coarsely."""
-    links = []
-    for i, link in enumerate(robot.links):
-        visuals = []
-        for k, shape in enumerate(link.visuals):
-            path = scratch / f"primitive_{i}_{k}.stl"
-            solid_mesh(shape.geometry).export(path)
-            visuals.append(replace(shape, geometry=Mesh(path)))
-        links.append(replace(link, visuals=tuple(visuals)))
-    return robot.with_links(links)
 
 
 if __name__ == "__main__":

@@ -133,7 +133,8 @@ def _type(schema: dict[str, Any]) -> str:
         return f"map to {_type(schema['additionalProperties'])}"
     if "exclusiveMinimum" in schema:
         return f"number > {schema['exclusiveMinimum']}"
-    return {"string": "text", "boolean": "`true`, `false`"}.get(schema["type"], schema["type"])
+    kind: str = schema["type"]
+    return {"string": "text", "boolean": "`true`, `false`"}.get(kind, kind)
 
 
 def _default(schema: dict[str, Any]) -> str:

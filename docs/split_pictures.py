@@ -13,14 +13,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from morphgen.benchmark.figures import MapPanel, map_png
-from morphgen.encoding.similarity import (
-    MEASURES,
-    classical_mds,
-    features,
-    similarity_matrix,
-    to_distances,
-)
+from morphgen.benchmark.figures import map_png
+from morphgen.encoding.similarity import MEASURES, features, similarity_matrix
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.library import default_library
 from morphgen.splits.split import Member, compose_member
@@ -50,10 +44,8 @@ def main() -> int:
     names = [robot.name for robot in robots_features]
     categories = [member.category for member in members.values()]
     values = similarity_matrix(robots_features, args.measure)
-    title = f"{args.measure}: {MEASURES[args.measure].meaning}"
     args.out.mkdir(parents=True, exist_ok=True)
-    points = classical_mds(to_distances(values, args.measure))
-    (args.out / "map.png").write_bytes(map_png(names, [MapPanel(title, points)], categories))
+    (args.out / "map.png").write_bytes(map_png(names, {args.measure: values}, categories))
     print(f"{len(names)} robots: {args.out}/map.png")
     return 0
 

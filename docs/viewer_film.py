@@ -18,9 +18,10 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from viewer_pictures import WAIT, hide_notice, served, started_browser
+from viewer_pictures import WAIT, hide_notice, served
 
 from morphgen.tasks.render.renderer import Frame, write_video
+from viewer_speed import started_browser
 
 SIZE = (1280, 800)
 """Size of the browser's window [pixels]."""
