@@ -183,7 +183,10 @@ def objects_table() -> str:
 
 def ee_task_table() -> str:
     """Return success of the split in which robots have different tasks, by side and task."""
-    push, reach = (results_of("ee-task-30m", EE_TASK, task) for task in ("push", "reach"))
+    push, reach = (
+        results_of("ee-task-30m", EE_TASK, task) | results_of("ee-task-20m", EE_TASK, task)
+        for task in ("push", "reach")
+    )
     order = [*AGENTS, *BASELINES]
     lines = []
     keys = [key for key in {*push, *reach} if key[0] in order]
@@ -203,7 +206,7 @@ def ee_task_table() -> str:
 def seeds_table() -> str:
     """Return the splits of each study on which an agent has one seed, or no run as others have."""
     lines = []
-    for study in (*STUDIES, "ee-task-30m", "objects-30m", "reach-24m"):
+    for study in (*STUDIES, "ee-task-30m", "ee-task-20m", "objects-30m", "reach-24m"):
         seeds: dict[str, dict[str, set[int]]] = {}
         for row in rows_of(study):
             if row.method in AGENTS and row.transitions:
