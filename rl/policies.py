@@ -150,7 +150,7 @@ def make_networks(config: PolicyConfig, layout: Layout, seed: int) -> tuple[Acto
         raise TaskError(f"tool_position {config.tool_position}: the environments {shown} it")
     observed = {*layout.channels, *(name for name, _ in layout.vectors)}
     observed |= {"tree"} if layout.tree else set()
-    missing = sorted(set(config.channels) - {"points", "no_state"} - observed)
+    missing = sorted(set(config.channels) - {"points", "no_state", "pace"} - observed)
     if missing:
         raise TaskError(f"observation channels {', '.join(missing)}: the environments lack them")
     with torch.random.fork_rng(devices=[]):

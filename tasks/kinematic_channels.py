@@ -161,6 +161,8 @@ ROTATION_SCALE = 5.0
 GAINS = (0.25, 1.0, 4.0)
 """Gains of a wanted joint step, in largest steps, before it is squashed by tanh: the highest one
 resolves the last millimetres, the lowest one distances of many steps."""
+REFERENCE_STEP = 0.045
+"""Mean largest step of revolute joints with ``pace``, that of the grammar ``serial`` [rad]."""
 SINGULAR = 1e-4
 """Added to the squared length of a Jacobian column, so that short ones ask for no large step."""
 NEAR = 1e-3  # distance below which the logarithm of a distance hardly changes [m or rad]
@@ -250,7 +252,9 @@ class KinematicChannels:
         numbers of ``clearance``, the direction from the box to the link in the root frame, and
         where the link is on the box, in half edges. All fade out like the change of the distance.
 
-    Links without an independent joint have zeros, except in ``poses``.
+    Links without an independent joint have zeros, except in ``poses``. Observations of slow arms
+    are unlike those of fast ones, as most are in largest steps. With ``pace`` the steps are those
+    of an arm whose joints are faster by a common factor, which is left out.
     """
 
     def __init__(
@@ -259,6 +263,7 @@ class KinematicChannels:
         env_robot_index: torch.Tensor,
         names: Sequence[str],
         *,
+        pace: bool,
         has_object: torch.Tensor | None,
         obstacles: torch.Tensor,
         obstacle_sizes: torch.Tensor,
@@ -267,6 +272,7 @@ class KinematicChannels:
     ) -> None:
         """Gather the tables of every environment; ``space_of`` returns its scene.
 
+        With ``pace``, largest steps are multiplied so that their mean is ``REFERENCE_STEP``.
         ``has_object`` says which scenes have an object, (n,), bool; None leaves its columns out.
         ``obstacles`` are the current poses of boxes, (n, O, 7), which the caller updates in place;
         ``obstacle_sizes`` are their edges (n, O, 3) [m], zero for padding.
@@ -279,6 +285,8 @@ class KinematicChannels:
         self._link_mask = tables.link_mask[index]
         self._lower, self._upper = tables.lower[index], tables.upper[index]
         self._max_step = tables.max_step[index]
+        if pace:
+            self._max_step = self._max_step * _pace(tables)[index, None]
         # Padding has a largest step of zero; its columns are zero, too.
         self._per_step = 1 / self._max_step.clamp(min=1e-6)
         self._effort = tables.effort[index].clamp(min=NEAR).log() / 5  # 150 N m become one
@@ -541,6 +549,14 @@ class KinematicChannels:
         """Return values of joints (n, J, k) at the links that they move, shape (n, L, k)."""
         index = self._joint.clamp(min=0)[..., None].expand(-1, -1, values.shape[-1])
         return torch.gather(values, 1, index) * (self._joint >= 0)[..., None]
+
+
+def _pace(tables: RobotTables) -> torch.Tensor:
+    """Return by how much faster robots would have ``REFERENCE_STEP``, shape (R,)."""
+    step = tables.max_step
+    turns = (tables.moves_tool & ~tables.is_prismatic & (step > 0)).float()
+    mean = (step * turns).sum(dim=1) / turns.sum(dim=1).clamp(min=1)
+    return torch.where(mean > 0, REFERENCE_STEP / mean.clamp(min=1e-6), 1.0)
 
 
 def _half_extents(geometry: torch.Tensor) -> torch.Tensor:

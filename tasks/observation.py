@@ -68,6 +68,8 @@ class ObservationConfig:
     """Whether to observe how near the links that a joint moves are to obstacles."""
     contact: bool = False
     """Whether to observe how near those links are to the object, and where."""
+    pace: bool = False
+    """Whether kinematic channels show all robots as equally fast; see ``kinematic_channels``."""
     tree: bool = False
     """Whether to observe how the actuated joints are connected; see ``tree_entries``."""
     state: bool = True
@@ -90,6 +92,9 @@ class ObservationConfig:
             )
         if not self.state and not self.points:
             raise TaskError("observation without state: expected points, which replace it")
+        if self.pace and not self.kinematic_channels:
+            names = ", ".join(KINEMATIC_CHANNELS)
+            raise TaskError(f"observation channel pace: expected one that it changes: {names}")
 
     @property
     def kinematic_channels(self) -> tuple[str, ...]:
@@ -479,6 +484,7 @@ class BatchObservation:
                 robot_tables,
                 index,
                 names,
+                pace=config.pace,
                 has_object=has_object if config.objects or bool(has_object.any()) else None,
                 obstacles=layouts.poses,
                 obstacle_sizes=layouts.sizes,

@@ -27,9 +27,10 @@ the meshes, which are closer to them and take more time."""
 COLLISION_GEOMETRIES: tuple[CollisionGeometry, ...] = get_args(CollisionGeometry)
 CHANNELS = (
     *KINEMATIC_CHANNELS,
-    *("velocity", "previous_action", "tree", "points", "no_state"),
+    *("velocity", "previous_action", "tree", "points", "no_state", "pace"),
 )
-"""Channels of observations that can be asked for by name; ``no_state`` hides what it names."""
+"""Channels of observations that can be asked for by name; ``no_state`` hides what it names, and
+``pace`` changes others."""
 
 
 class Named(Protocol):

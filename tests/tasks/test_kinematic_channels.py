@@ -215,12 +215,38 @@ def test_channels_are_asked_for_by_name():
         3,
     )
     for name in CHANNELS:
-        if name != "no_state":
+        if name not in ("no_state", "pace"):
             assert observation_config([name]) != observation_config([])
     with pytest.raises(TaskError, match=r"unknown observation channel 'jacobain'.*jacobian"):
         observation_config(["jacobain"])
     with pytest.raises(TaskError, match="expected points"):
         observation_config(["no_state"])
+    with pytest.raises(TaskError, match="channel pace: expected one that it changes: lag"):
+        observation_config(["velocity", "pace"])
+
+
+def test_with_pace_a_slow_arm_looks_like_a_fast_one(specs):
+    names = ("lag", "joint", "jacobian", "dls", "contact", "pace")
+    fast = specs[1].robot
+    joints = (replace(each, velocity=each.velocity and each.velocity / 5) for each in fast.joints)
+    slow = replace(fast, joints=tuple(joints))
+    seen = {}
+    for robot in (fast, slow):
+        pair = [specs[0], replace(specs[1], robot=robot)]
+        for channels in (names[:-1], names):
+            batch = batch_from_specs(
+                pair, 4, sim="kinematic", observe=observation_config(channels), seed=3
+            )
+            observation = batch.reset()
+            seen[robot is slow, "pace" in channels] = observation
+    for name in names[:-1]:
+        ours = [seen[is_slow, True][name] for is_slow in (False, True)]
+        torch.testing.assert_close(*ours, msg=name)
+    steps = [seen[is_slow, False]["jacobian"][1::2] for is_slow in (False, True)]
+    assert not torch.allclose(*steps)
+    turning = batch.robot_tables.max_step[batch.env_robot_index] > 0
+    largest = batch.observation._kinematics._max_step
+    assert torch.allclose((largest * turning).sum(dim=1) / turning.sum(dim=1), torch.tensor(0.045))
 
 
 CHANGE = 3
