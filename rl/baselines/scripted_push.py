@@ -398,6 +398,7 @@ class PushPlanner:
         centred[:, 0] += each.offset
         over = overhang(self._space, q, centred, edge)
         goal = each.position.copy()
+        # In this order: plans, and the data sets of them, depend on the last bits.
         goal[:, 0] = block[:, 0] + (each.position[:, 0] - block[:, 0] - each.offset)
         for i in range(1, _SIMULATED + 1):
             ahead = length * i / _SIMULATED
