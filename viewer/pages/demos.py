@@ -73,5 +73,8 @@ def show(session: Session) -> None:
     session.on_change(number, play, "play")
     session.on_change(move, step)
     session.apply_state()
-    seek(number.value)  # an address may name an episode that its other choices leave out
+    if 0 <= number.value < count:
+        seek(number.value)  # an address may name an episode that its other choices leave out
+    else:
+        play()  # says that there is no such episode
     page.add_downloads()
