@@ -4,6 +4,7 @@ import json
 import math
 import re
 import sys
+import time
 from contextlib import nullcontext
 from dataclasses import asdict, fields, replace
 from math import isnan
@@ -205,6 +206,8 @@ def test_tensorboard_reads_the_events(tmp_path):
     accumulators = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     first, second, third = report(1, success=math.nan), report(2, success=0.0), report(3)
     record(tmp_path, first, second, third, tensorboard=True)
+    # Files are read by the second in their names, then by a counter as text: 10 before 9.
+    time.sleep(1)
     record(tmp_path, report(3, success=0.2), after=2, tensorboard=True)
     shown = accumulators.EventAccumulator(str(tmp_path / "events")).Reload()
     points = [(each.step, each.value) for each in shown.Scalars("success")]
