@@ -152,27 +152,18 @@ def test_other_environments_equal_the_batch(make, task, options, in_numpy):
     assert task == "reach" or not env.reset()[0]["object"].any()
 
 
-def test_push_over_the_line_terminates_as_in_the_batch(make):
-    env, batch = make("push")
+@pytest.mark.parametrize(
+    ("task", "number", "beyond", "here"),
+    [("push", lambda envs: envs.line, 1.0, -2.0), ("door", lambda e: e.formulas.travel, 0.1, -0.1)],
+)
+def test_an_object_at_its_goal_terminates_as_in_the_batch(make, task, number, beyond, here):
+    env, batch = make(task)
     env.reset(seed=1)
     batch.reset(1)
     action = np.zeros(env.action_space.shape, np.float32)
-    for line, succeeds in ((1.0, False), (-2.0, True)):
+    for goal, succeeds in ((beyond, False), (here, True)):
         for each in (env.batch, batch):
-            each.groups["push"].line.fill_(line)
-        result = env.step(action)
-        assert_step_equals(result, env, batch.step(torch.zeros(batch.action_mask.shape)))
-        assert result[2] is result[4]["success"] is succeeds
-
-
-def test_object_at_its_goal_terminates_as_in_the_batch(make):
-    env, batch = make("door")
-    env.reset(seed=1)
-    batch.reset(1)
-    action = np.zeros(env.action_space.shape, np.float32)
-    for travel, succeeds in ((0.1, False), (-0.1, True)):
-        for each in (env.batch, batch):
-            each.groups["door"].formulas.travel.fill_(travel)
+            number(each.groups[task]).fill_(goal)
         result = env.step(action)
         assert_step_equals(result, env, batch.step(torch.zeros(batch.action_mask.shape)))
         assert result[2] is result[4]["success"] is succeeds
