@@ -140,9 +140,8 @@ def test_a_rejected_file_fails_the_row_of_its_loader(tmp_path):
 
 
 def test_a_missing_loader_is_reported(tmp_path, monkeypatch):
-    real = find_spec
     monkeypatch.setattr(
-        module, "find_spec", lambda name: None if name == "pinocchio" else real(name)
+        module, "find_spec", lambda name: None if name == "pinocchio" else find_spec(name)
     )
     report = conformance(bundle(arm(), tmp_path), samples=2)
     row = next(row for row in report.rows if row.loader == "pinocchio")
@@ -168,12 +167,7 @@ def test_a_folder_that_is_not_a_bundle_is_an_error(tmp_path):
     [
         ({"limits": (-2.0, 1.9)}, "limits", "upper limit 2, not 1.9", LOADERS),
         ({"effort": 40.0}, "limits", "effort 50, not 40", OF_ALL_VALUES),
-        (
-            {"velocity": 3.0},
-            "limits",
-            "velocity 2, not 3",
-            ["yourdfpy", "pybullet", "pinocchio"],
-        ),
+        ({"velocity": 3.0}, "limits", "velocity 2, not 3", ["yourdfpy", "pybullet", "pinocchio"]),
         ({"damping": 0.5}, "damping", "damping 0, not 0.5", OF_ALL_VALUES),
         ({"friction": 0.1}, "damping", "friction 0, not 0.1", OF_ALL_VALUES),
     ],
@@ -281,10 +275,17 @@ def test_what_libraries_round_is_no_disagreement(robot, tmp_path):
 
 BOX = '<geometry><box size="0.1 0.1 0.1"/></geometry>'
 INERTIA = '<inertia ixx="0.01" iyy="0.02" izz="0.025" ixy="0" ixz="0" iyz="0"/>'
-LIMIT = '<limit lower="-1" upper="1" effort="5" velocity="1"/>'
+TIP = f'<inertial><mass value="0.1"/>{INERTIA}</inertial>'
 
 
-def pendulum(tmp_path, *, base=INERTIA, bar=INERTIA, kind="revolute", limit=LIMIT, tip=""):
+def limit(lower, upper):
+    return f'<limit lower="{lower}" upper="{upper}" effort="5" velocity="1"/>'
+
+
+LIMIT = limit(-1, 1)
+
+
+def pendulum(tmp_path, *, base=INERTIA, bar=INERTIA, kind="revolute", limit=LIMIT, tip=TIP):
     """Write a bar on a base, with a tip that is fixed to it; return the file."""
 
     def link(name, inertia):
@@ -312,64 +313,31 @@ def file_rows(path):
 NO_BASE = ("joins the base to the world, without its mass",)
 KILOGRAM = ("gives links without inertia 1 kg and 1 kg m^2",)
 COUNTS = ("counts the inertia of links without mass",)
-TURNED = "reads a range in the wrong order as none"
+TURNED = ("reads a range in the wrong order as none",)
 ZERO_RANGE = ("reads a range that is missing as 0 to 0",)
+LIMITED = ("limits continuous joints that name a range",)
+SHAPES = "gives links without inertia that of their shapes, of 1000 kg/m^3"
+NO_BODY = ("sets inertia that no body has to zero",)
 IMPOSSIBLE = '<inertia ixx="0.01" iyy="0.02" izz="0.05" ixy="0" ixz="0" iyz="0"/>'
 MASSLESS = f'<inertial><mass value="0"/>{INERTIA}</inertial>'
-TIP = f'<inertial><mass value="0.1"/>{INERTIA}</inertial>'
 NO_RANGE = '<limit effort="5" velocity="1"/>'
 
 
-# changes of the pendulum; causes of PyBullet, of MuJoCo, and of both others
+# changes of the pendulum; causes of PyBullet, of MuJoCo, and of others
 @pytest.mark.parametrize(
     ("changes", "pybullet", "mujoco", "others"),
     [
-        ({}, KILOGRAM, NO_BASE, {}),
-        ({"tip": TIP, "base": ""}, KILOGRAM, (), {}),
-        (
-            {"tip": TIP, "bar": ""},
-            KILOGRAM,
-            ("gives links without inertia that of their shapes, of 1000 kg/m^3", *NO_BASE),
-            {},
-        ),
-        (
-            {"tip": TIP, "bar": IMPOSSIBLE},
-            ("sets inertia that no body has to zero",),
-            ("refuses inertia that no body has",),
-            {},
-        ),
+        ({"tip": ""}, KILOGRAM, NO_BASE, {}),
+        ({"base": ""}, KILOGRAM, (), {}),
+        ({"bar": ""}, KILOGRAM, (SHAPES, *NO_BASE), {}),
+        ({"bar": IMPOSSIBLE}, NO_BODY, ("refuses inertia that no body has",), {}),
         ({"tip": MASSLESS}, COUNTS, NO_BASE, {"pinocchio": COUNTS}),
-        (
-            {"tip": TIP, "kind": "continuous"},
-            ("limits continuous joints that name a range",),
-            NO_BASE,
-            {},
-        ),
-        (
-            {"tip": TIP, "limit": NO_RANGE},
-            (),
-            NO_BASE,
-            {"pinocchio": ZERO_RANGE, "usd": ZERO_RANGE},
-        ),
-        (
-            {"tip": TIP, "limit": LIMIT.replace("1", "0", 2)},
-            (),
-            (*NO_BASE, "reads a range of 0 to 0 as none"),
-            {},
-        ),
-        *(
-            (
-                {"tip": TIP, "kind": kind, "limit": LIMIT.replace('"-1" upper="1"', turned)},
-                (TURNED,),
-                (*NO_BASE, TURNED),
-                {},
-            )
-            for kind, turned in (
-                ("revolute", '"1" upper="-1"'),
-                ("prismatic", '"0.1" upper="0"'),
-                ("prismatic", '"2" upper="1"'),
-            )
-        ),
+        ({"kind": "continuous"}, LIMITED, NO_BASE, {}),
+        ({"limit": NO_RANGE}, (), NO_BASE, {"pinocchio": ZERO_RANGE, "usd": ZERO_RANGE}),
+        ({"limit": limit(0, 0)}, (), (*NO_BASE, "reads a range of 0 to 0 as none"), {}),
+        ({"limit": limit(1, -1)}, TURNED, (*NO_BASE, *TURNED), {}),
+        ({"limit": limit(0.1, 0), "kind": "prismatic"}, TURNED, (*NO_BASE, *TURNED), {}),
+        ({"limit": limit(2, 1), "kind": "prismatic"}, TURNED, (*NO_BASE, *TURNED), {}),
     ],
 )
 def test_what_a_loader_does_with_a_file_is_named(changes, pybullet, mujoco, others, tmp_path):
@@ -386,6 +354,9 @@ NO_INERTIA = "refuses <inertial> without <inertia>"
 REPEATED = "refuses a repeated element"
 SCALE = "refuses a mesh scale of more than three numbers"
 NO_SIZE = "refuses shapes without a size"
+NO_MASS = "refuses moving links without mass or inertia"
+NO_LEADER = "refuses a joint that mimics a missing one"
+TOO_MANY = "fails on robots with more than 127 links"
 
 
 def many_links(count):
@@ -399,33 +370,20 @@ def many_links(count):
     [
         ({"bar": " "}, None, NO_INERTIA, {"pybullet", "mujoco (urdf)"}),
         ({"base": " ", "bar": " "}, None, NO_INERTIA, {"pybullet", "mujoco (urdf)"}),
-        (
-            {"bar": " ", "tip": ""},
-            ('value="2"', 'value="0"'),
-            "refuses moving links without mass or inertia",
-            {"mujoco (urdf)"},
-        ),
-        (
-            {},
-            (AXIS, f'{AXIS}<mimic joint="gone" multiplier="2"/>'),
-            "refuses a joint that mimics a missing one",
-            {"usd"},
-        ),
+        ({"bar": " ", "tip": ""}, ('value="2"', 'value="0"'), NO_MASS, {"mujoco (urdf)"}),
+        ({}, (AXIS, f'{AXIS}<mimic joint="gone" multiplier="2"/>'), NO_LEADER, {"usd"}),
         ({}, (AXIS, AXIS + '<axis xyz="1 0 0"/>' + AXIS), REPEATED, {"mujoco (urdf)"}),
         ({}, (LIMIT, 2 * LIMIT), REPEATED, {"mujoco (urdf)"}),
         ({}, (BOX, f"<geometry>{FOUR}</geometry>"), SCALE, {"mujoco (urdf)", "usd"}),
         ({"tip": f"{TIP}<visual><geometry>{FOUR}</geometry></visual>"}, None, SCALE, {"usd"}),
         ({}, ('box size="0.1 0.1 0.1"', 'sphere radius="0"'), NO_SIZE, {"mujoco (urdf)"}),
-        ({}, many_links(126), "fails on robots with more than 127 links", {"pybullet"}),
-        pytest.param(  # far beyond the limit
-            *({}, many_links(150), "fails on robots with more than 127 links", {"pybullet"}),
-            marks=pytest.mark.slow,
-        ),
+        ({}, many_links(126), TOO_MANY, {"pybullet"}),
+        pytest.param({}, many_links(150), TOO_MANY, {"pybullet"}, marks=pytest.mark.slow),
     ],
 )
 def test_what_a_loader_refuses_is_named(changes, edit, words, loaders, tmp_path):
     trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "cube.stl")
-    path = pendulum(tmp_path, **{"tip": TIP, **changes})
+    path = pendulum(tmp_path, **changes)
     path.write_text(path.read_text().replace(*edit or ("", "")))
     rows = file_rows(path)
     assert not [row for row in rows.values() if row.is_unexplained]
@@ -437,7 +395,7 @@ def test_a_refusal_without_its_cause_is_unexplained(tmp_path, monkeypatch):
     """The words of a message are not enough: the loader must read the file without the cause."""
     idle = tuple(replace(refusal, change=lambda root, urdf: None) for refusal in module.REFUSALS)
     monkeypatch.setattr(module, "REFUSALS", idle)
-    assert file_rows(pendulum(tmp_path, tip=TIP, bar=IMPOSSIBLE))["mujoco (urdf)"].is_unexplained
+    assert file_rows(pendulum(tmp_path, bar=IMPOSSIBLE))["mujoco (urdf)"].is_unexplained
 
 
 @pytest.mark.parametrize(
@@ -457,7 +415,7 @@ def test_a_fault_of_our_reader_is_unexplained(wrong, tmp_path, monkeypatch):
         return replace(inertial, **wrong) if inertial and inertial.mass == 2 else inertial
 
     monkeypatch.setattr(urdf, "_inertial", misread)
-    rows = file_rows(pendulum(tmp_path, tip=TIP))
+    rows = file_rows(pendulum(tmp_path))
     for name in {"pybullet", "mujoco (urdf)", "pinocchio"} & rows.keys():
         assert rows[name].is_unexplained, rows[name]
 
@@ -479,7 +437,7 @@ def test_a_mjcf_of_others_is_compared_as_it_is(tmp_path):
 
 
 def test_a_xacro_is_expanded_for_the_loaders(tmp_path):
-    path = pendulum(tmp_path, tip=TIP, base="").rename(tmp_path / "pendulum.xacro")
+    path = pendulum(tmp_path, base="").rename(tmp_path / "pendulum.xacro")
     text = path.read_text().replace('value="2"', 'value="${1 + 1}"')
     path.write_text(text.replace("<robot ", '<robot xmlns:xacro="http://ros.org/xacro" ', 1))
     assert file_rows(path)["mujoco (urdf)"].passed

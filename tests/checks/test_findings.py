@@ -1,6 +1,7 @@
 """Findings, repairs, and home poses."""
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -42,35 +43,43 @@ from morphgen.model.robot import (
 from morphgen.model.tree import rename, scale_links
 
 
+@pytest.fixture(autouse=True)
+def _few_faces(monkeypatch):
+    monkeypatch.setattr(rules, "MAX_STL_FACES", 1000)
+
+
 def found(robot, code):
     """Return the first finding with a code."""
     return next(finding for finding in check(robot) if finding.code == code)
 
 
-def test_a_valid_robot_has_no_findings(tmp_path):
-    assert check(valid_robot()) == ()
-    assert check(valid_robot_with_mesh(tmp_path)) == ()
+def codes(robot):
+    return {finding.code for finding in check(robot)}
+
+
+def faulty(code, folder):
+    return ROBOTS[code]() if code in ROBOTS else MESHES[code](folder)
+
+
+def test_a_valid_robot_has_no_findings_and_no_repairs(tmp_path):
+    for robot in (valid_robot(), valid_robot_with_mesh(tmp_path)):
+        assert check(robot) == ()
+        assert fix(robot) == (robot, ())
 
 
 def test_a_mimic_gripper_has_only_the_finding_about_loaders():
     assert [finding.severity for finding in check(arm())] == ["info"]
 
 
-@pytest.mark.parametrize("code", MESHES)
-def test_each_fault_of_a_mesh_has_its_finding(code, tmp_path, monkeypatch):
-    monkeypatch.setattr(rules, "MAX_STL_FACES", 1000)
-    assert code in {finding.code for finding in check(MESHES[code](tmp_path))}
-
-
-@pytest.mark.parametrize("code", ROBOTS)
-def test_each_fault_has_its_finding_and_all_are_sorted(code):
-    findings = check(ROBOTS[code]())
+@pytest.mark.parametrize("code", [*ROBOTS, *MESHES])
+def test_each_fault_has_its_finding_and_all_are_sorted(code, tmp_path):
+    findings = check(faulty(code, tmp_path))
     assert code in {finding.code for finding in findings}
     rank = ["error", "warning", "info"]
     assert list(findings) == sorted(
         findings, key=lambda f: (rank.index(f.severity), f.code, f.where)
     )
-    assert findings == check(ROBOTS[code]())
+    assert findings == check(faulty(code, tmp_path))
     assert all(f.why and f.fix and "\n" not in f.why + f.fix for f in findings)
 
 
@@ -90,31 +99,20 @@ def test_a_bare_frame_needs_no_mass():
 
 
 def test_a_massless_link_is_an_error_only_without_a_rigid_neighbour_with_mass():
-    shape = valid_robot().link("right").collisions
-    moving = with_end(Link("pad", collisions=shape), hinge("pad"))
-    fixed = with_end(
-        Link("pad", collisions=shape), replace(hinge("pad"), kind="fixed", limits=None)
-    )
-    assert found(moving, "inertia-missing").severity == "error"
-    assert found(fixed, "inertia-missing").severity == "info"
+    pad = Link("pad", collisions=valid_robot().link("right").collisions)
+    fixed = replace(hinge("pad"), kind="fixed", limits=None)
+    assert found(with_end(pad, hinge("pad")), "inertia-missing").severity == "error"
+    assert found(with_end(pad, fixed), "inertia-missing").severity == "info"
 
 
-def test_the_triangle_inequality_agrees_with_mujoco():
-    for low, code in ((1.0001e-3, None), (0.9999e-3, "inertia-not-physical")):
-        body = (low, 0.0, 0.0, low, 0.0, 2e-3)
-        codes = {finding.code for finding in check(with_body("lower", inertia=body))}
-        assert (code in codes) is (code is not None)
-        moments = " ".join(str(body[i]) for i in (0, 3, 5))
-        xml = (
-            "<mujoco><worldbody><body><joint/>"
-            f'<inertial pos="0 0 0" mass="1" diaginertia="{moments}"/>'
-            "</body></worldbody></mujoco>"
-        )
-        if code is None:
-            mujoco.MjModel.from_xml_string(xml)
-        else:
-            with pytest.raises(ValueError, match="A \\+ B >= C"):
-                mujoco.MjModel.from_xml_string(xml)
+@pytest.mark.parametrize(("low", "is_physical"), [(1.0001e-3, True), (0.9999e-3, False)])
+def test_the_triangle_inequality_agrees_with_mujoco(low, is_physical):
+    robot = with_body("lower", inertia=(low, 0.0, 0.0, low, 0.0, 2e-3))
+    assert ("inertia-not-physical" not in codes(robot)) is is_physical
+    inertial = f'<inertial pos="0 0 0" mass="1" diaginertia="{low} {low} 2e-3"/>'
+    xml = f"<mujoco><worldbody><body><joint/>{inertial}</body></worldbody></mujoco>"
+    with nullcontext() if is_physical else pytest.raises(ValueError, match=r"A \+ B >= C"):
+        mujoco.MjModel.from_xml_string(xml)
 
 
 def test_a_long_axis_is_an_error_only_for_prismatic_joints():
@@ -125,7 +123,7 @@ def test_a_long_axis_is_an_error_only_for_prismatic_joints():
 
 def test_an_axis_rounded_in_a_file_is_a_unit_axis():
     robot = with_joint(valid_robot(), "elbow", axis=(0.7071, 0.7071, 0.0))
-    assert "axis-not-unit" not in {finding.code for finding in check(robot)}
+    assert "axis-not-unit" not in codes(robot)
 
 
 def test_the_range_of_a_mimic_joint_includes_its_whole_chain():
@@ -144,7 +142,7 @@ def test_overlap_of_an_ignored_pair_is_not_a_finding():
     pairs = [finding.where for finding in check(robot) if finding.code == "self-collision"]
     ignored = tuple(tuple(pair.removeprefix("links ").split(", ")) for pair in pairs)
     assert ignored
-    assert "self-collision" not in {f.code for f in check(replace(robot, ignore_pairs=ignored))}
+    assert "self-collision" not in codes(replace(robot, ignore_pairs=ignored))
 
 
 def keys(robot):
@@ -153,20 +151,13 @@ def keys(robot):
 
 
 @pytest.mark.parametrize("code", [code for code in (*ROBOTS, *MESHES) if "name-" not in code])
-def test_exactly_the_fixable_findings_are_fixed(code, tmp_path, monkeypatch):
-    monkeypatch.setattr(rules, "MAX_STL_FACES", 1000)
-    robot = ROBOTS[code]() if code in ROBOTS else MESHES[code](tmp_path)
-    findings = check(robot)
+def test_exactly_the_fixable_findings_are_fixed(code, tmp_path):
+    robot = faulty(code, tmp_path)
     repaired, gone = fix(robot)
-    fixable = {finding for finding in findings if finding.fixable}
+    fixable = {finding for finding in check(robot) if finding.fixable}
     assert set(gone) == fixable
     assert keys(repaired) == keys(robot) - {(finding.code, finding.where) for finding in fixable}
     assert fix(repaired)[1] == ()
-
-
-def test_a_valid_robot_is_unchanged():
-    robot = valid_robot()
-    assert fix(robot) == (robot, ())
 
 
 def test_missing_mass_is_that_of_the_solid_geometry():
@@ -212,7 +203,7 @@ def test_a_nan_home_becomes_the_position_within_limits_nearest_to_zero():
 def test_names_are_changed_everywhere():
     broken = rename(arm(), {"left": "left pad", "right": "left_pad"}, {"left": "left/1"})
     robot, gone = fix(replace(broken, ignore_pairs=(("left pad", "left_pad"),)))
-    assert "name-characters" not in {finding.code for finding in check(robot)}
+    assert "name-characters" not in codes(robot)
     assert {finding.code for finding in gone} == {"name-characters"}
     assert [link.name for link in robot.links[4:]] == ["left_pad_2", "left_pad"]
     assert robot.joints[3].child == "left_pad_2"

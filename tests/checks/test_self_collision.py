@@ -31,11 +31,9 @@ from morphgen.model.geometry import Box, Mesh, Pose, Shape, Sphere
 from morphgen.model.kinematics import forward_kinematics, random_configurations
 from morphgen.model.robot import Frame, Inertial, Joint, Link, Robot
 
-BALL = (Shape(Sphere(0.05)),)
 
-
-def ball(name):
-    return Link(name, collisions=BALL)
+def ball(name, radius=0.05):
+    return Link(name, collisions=(Shape(Sphere(radius)),))
 
 
 def penetrations(robot, q):
@@ -81,7 +79,7 @@ def test_touching_faces_do_not_collide():
 
 def test_links_of_the_root_are_tested():
     """MuJoCo by default does not test bodies welded to the world against their children."""
-    robot = chain(ball("a"), replace(ball("b"), collisions=(Shape(Sphere(0.3)),)))
+    robot = chain(ball("a"), ball("b", 0.3))
     (found,) = penetrations(robot, [robot.home])
     assert set(found) == {("a", "b")}
 
@@ -230,27 +228,15 @@ def test_repeated_epa_failure_is_an_error(monkeypatch):
 SAMPLES = 400
 
 
-def ball_on_arm(name, radius):
-    return Link(name, collisions=(Shape(Sphere(radius)),))
-
-
 def at(x, z):
     return Pose((x, 0.0, z))
 
 
 def balls():
     """A robot of one ball per link, so that its collisions are distances between centres."""
-    links = (
-        ball_on_arm("base", 0.1),
-        ball_on_arm("turn", 0.05),
-        Link("bare"),
-        ball_on_arm("knob", 0.05),
-        ball_on_arm("slide", 0.05),
-        ball_on_arm("post", 0.1),
-        ball_on_arm("top", 0.1),
-        ball_on_arm("carrier", 0.05),
-        ball_on_arm("big", 0.87),
-    )
+    radii = {"base": 0.1, "turn": 0.05, "bare": None, "knob": 0.05, "slide": 0.05}
+    radii |= {"post": 0.1, "top": 0.1, "carrier": 0.05, "big": 0.87}
+    links = tuple(ball(name, radius) if radius else Link(name) for name, radius in radii.items())
     joints = (
         Joint("turn", "revolute", "base", "turn", at(0.3, 0.0), (0, 0, 1), (-3.0, 3.0)),
         Joint("bare", "fixed", "turn", "bare", at(0.0, 0.1)),
@@ -287,15 +273,8 @@ def test_reasons_and_counts_agree_with_brute_force():
         pair: sum(pair in pairs for pairs in colliding) for pair in sorted(set().union(*colliding))
     }
     assert matrix.collisions == counts
-    linked = {
-        ("base", "turn"),
-        ("knob", "turn"),
-        ("knob", "slide"),
-        ("base", "post"),
-        ("post", "top"),
-        ("base", "carrier"),
-        ("big", "carrier"),
-    }
+    linked = {("base", "turn"), ("knob", "turn"), ("knob", "slide"), ("base", "post")}
+    linked |= {("post", "top"), ("base", "carrier"), ("big", "carrier")}
     (at_home,) = colliding_pairs(robot, np.array([robot.home]))
     names = sorted(link.name for link in robot.links if link.collisions)
     expected = {("bare", "turn"): "User"}
