@@ -40,12 +40,8 @@ def test_compose_writes_a_bundle_and_prints_its_summary(ok, tmp_path):
     out = ok("compose", "base=gantry", "ee=plane", "--out", "robots")
     first, *files = out.splitlines()
     assert first.startswith("robots/gantry-plane: 7 links, 5 DoF, ")
-    assert [name.strip() for name in files] == [
-        "card.json",
-        "preview.png",
-        "robot.urdf",
-        "robot.xml",
-    ]
+    names = ["card.json", "preview.png", "robot.urdf", "robot.xml"]
+    assert [name.strip() for name in files] == names
     assert [path.name for path in (tmp_path / "robots").iterdir()] == ["gantry-plane"]
     data = json.loads(ok("compose", "base=gantry", "ee=plane", "--no-picture", "--json"))
     assert data["folder"] == "robots/gantry-plane"
@@ -126,18 +122,8 @@ def test_check_prints_code_location_and_fix_of_a_finding(run, robot_urdf):
     assert remedy.startswith("    fix: ")
     _, out, _ = run("check", path, "--json")
     (data,) = json.loads(out)[str(path)]["findings"]
-    assert (data["code"], data["where"], data["severity"]) == (
-        "limits-inverted",
-        "joint elbow",
-        "error",
-    )
-
-
-def test_check_reports_a_broken_structure_as_findings(run, urdf):
-    path = urdf('<robot name="r"><link name="a"/><link name="b"/></robot>')
-    code, out, err = run("check", path, "--json")
-    assert (code, err) == (1, "")
-    assert [finding["severity"] for finding in json.loads(out)[str(path)]["findings"]] == ["error"]
+    parts = (data["code"], data["where"], data["severity"])
+    assert parts == ("limits-inverted", "joint elbow", "error")
 
 
 def test_check_fix_writes_a_bundle_without_the_faults(run, urdf, tmp_path):
@@ -172,12 +158,8 @@ def test_a_robot_that_cannot_be_read_does_not_stop_others(run, command):
 
 
 def test_a_missing_folder_does_not_stop_other_exports(run):
-    code, out, err = run("export", "gone/", "prims", "--format", "urdf")
-    assert (code, out, err) == (
-        2,
-        "prims-urdf\n",
-        "morphgen: gone/: gone: no such file or folder\n",
-    )
+    refusal = "morphgen: gone/: gone: no such file or folder\n"
+    assert run("export", "gone/", "prims", "--format", "urdf") == (2, "prims-urdf\n", refusal)
 
 
 def test_places_that_cannot_be_written_are_refused_before_the_work(refused, monkeypatch):
@@ -247,10 +229,8 @@ def test_import_passes_arguments_to_xacro_and_prints_repairs(run, ok, tmp_path):
 
 def test_conform_fails_for_a_bundle_whose_files_disagree(run, tmp_path):
     folder = write_bundle(arm(), tmp_path / "arm", picture=False)
-    other = write_bundle(replace(valid_robot(), name="other"), tmp_path / "other", picture=False)
-    (folder / "robot.xml").write_bytes(
-        (other / "robot.xml").read_bytes().replace(b"elbow", b"knee")
-    )
+    other = write_bundle(valid_robot(), tmp_path / "other", picture=False) / "robot.xml"
+    (folder / "robot.xml").write_bytes(other.read_bytes().replace(b"elbow", b"knee"))
     code, out, _ = run("conform", folder, "--samples", "2")
     assert code == 1
     assert "lacks joints elbow" in out
@@ -361,14 +341,11 @@ def test_demo_prints_one_line_if_it_cannot_write(run):
     assert err.count("\n") == 1
 
 
-def test_check_and_show_read_an_mjcf_of_any_suffix(run, ok, tmp_path):
+def test_check_and_show_read_an_mjcf_of_any_suffix(ok, tmp_path):
     path = write(tmp_path, TWO_JOINTS, "robot.mjcf")
-    out = ok("check", path, "--json")
-    assert {f["code"] for f in json.loads(out)[str(path)]["findings"]} == {
-        *("effort-missing", "velocity-missing", "self-collision")
-    }
-    code, out, _ = run("show", "robot.mjcf")
-    assert (code, out.splitlines()[0]) == (0, "test: 3 links, 2 DoF, 12.57 kg")
+    found = {f["code"] for f in json.loads(ok("check", path, "--json"))[str(path)]["findings"]}
+    assert found == {"effort-missing", "velocity-missing", "self-collision"}
+    assert ok("show", "robot.mjcf").splitlines()[0] == "test: 3 links, 2 DoF, 12.57 kg"
 
 
 ROBOT = {"words": "robot"}
@@ -451,56 +428,44 @@ def files(folder):
     return {path.as_posix() for path in paths if path.suffix != ".stl"}
 
 
+ROS2 = {"package.xml", "CMakeLists.txt", "launch/display.launch.py", "urdf/arm.urdf"}
+ROS2 |= {"config/arm.srdf", "config/display.rviz"}
+
+
 @pytest.mark.parametrize(
     ("name", "folder", "expected"),
     [
         ("urdf", "arm-urdf", {"robot.urdf"}),
         ("mjcf", "arm-mjcf", {"robot.xml"}),
         ("sdf", "arm-sdf", {"model.sdf", "model.config"}),
-        (
-            "ros2",
-            "arm_description",
-            {
-                "package.xml",
-                "CMakeLists.txt",
-                "urdf/arm.urdf",
-                "config/arm.srdf",
-                "config/display.rviz",
-                "launch/display.launch.py",
-            },
-        ),
+        ("ros2", "arm_description", ROS2),
     ],
 )
 def test_folders_are_written_into_the_output_folder_and_again(
-    run, tmp_path, name, folder, expected
+    run, refused, tmp_path, name, folder, expected
 ):
     bundle = write_bundle(arm(), tmp_path / "bundle", picture=False)
-    options = ("--samples", "20") if name == "ros2" else ()
+    words = ["export", bundle, "--format", name, "--out", tmp_path]
+    words += ["--samples", "20"] if name == "ros2" else []
     for _ in range(2):
-        code, out, _ = run("export", bundle, "--format", name, "--out", tmp_path, *options)
+        code, out, _ = run(*words)
         assert (code, out.strip()) == (0, str(tmp_path / folder))
     assert files(tmp_path / folder) == {*expected, MANIFEST}
     (tmp_path / folder / "mine").write_text("")
-    code, _, err = run("export", bundle, "--format", name, "--out", tmp_path, *options)
-    assert code == 2
-    assert "mine is not of the export" in err
-    assert {path.name for path in tmp_path.iterdir()} == {"bundle", folder}
+    assert "mine is not of the export" in refused(*words)
 
 
-def test_an_exported_urdf_has_the_fits_and_so_the_goals_of_the_robot(run, tmp_path):
+def test_an_exported_urdf_has_the_fits_and_so_the_goals_of_the_robot(run, tmp_path, refused):
     words = ("arm=xarm6", "ee=none")
     assert run("export", *words, "--format", "urdf", "--out", tmp_path)[0] == 0
     (urdf,) = tmp_path.glob("*/robot.urdf")
     assert (urdf.parent / FITS).is_file()
     composed, exported = load_robot(" ".join(words)), load_robot(urdf)
-    assert robot_hash(exported, visuals=False) == robot_hash(composed, visuals=False)
     assert run("import", urdf, "--name", "mine", "--no-picture")[0] == 0
-    assert robot_hash(load_robot("robots/mine"), visuals=False) == robot_hash(
-        composed, visuals=False
-    )
+    robots = (composed, exported, load_robot("robots/mine"))
+    assert len({robot_hash(robot, visuals=False) for robot in robots}) == 1
     (urdf.parent / FITS).write_text("[]")
-    code, _, err = run("check", urdf)
-    assert (code, FITS in err) == (2, True)
+    assert FITS in refused("check", urdf)
 
 
 def test_files_of_a_bundle_are_written_into_it(run, tmp_path):
@@ -545,11 +510,9 @@ def test_the_help_has_the_formats_and_the_default_number_of_samples():
 
 
 @pytest.mark.parametrize("name", ["srdf", "ros2", "curobo"])
-def test_export_without_a_tool_is_refused_before_the_fit(run, tmp_path, monkeypatch, name):
+def test_export_without_a_tool_is_refused_before_the_fit(tmp_path, monkeypatch, name, refused):
     monkeypatch.setattr(export, "as_spheres", lambda *given, **_: pytest.fail("fitted"))
     bundle = write_bundle(replace(arm(), frames=()), tmp_path / "a", picture=False)
     words = ("--format", name, "--spheres", "2", "--out", tmp_path)
-    code, _, err = run("export", bundle, *words)
-    assert code == 2
-    assert "robot 'arm' has no frame 'tool'" in err
+    assert "robot 'arm' has no frame 'tool'" in refused("export", bundle, *words)
     assert [path.name for path in tmp_path.iterdir()] == ["a"]

@@ -1,7 +1,7 @@
 """``morphgen fit`` of parts and robots: output, written files and rejected input."""
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -14,6 +14,7 @@ import yaml
 from helpers.commands import tree
 from helpers.parts import write_part
 from helpers.robots import arm
+from morphgen.fitting.quality import Quality
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.srdf import read_srdf
 from morphgen.formats.urdf.read import read_urdf
@@ -51,20 +52,6 @@ def meshes_of(folder, kind):
     """File names of meshes in a bundle's URDF: ``collision`` or ``visual``."""
     root = ElementTree.parse(folder / "robot.urdf").getroot()
     return [mesh.get("filename") for mesh in root.findall(f"link/{kind}/geometry/mesh")]
-
-
-def assert_same_inertials(fitted, source):
-    """Assert equal masses and inertias of the links, up to the digits of a URDF."""
-    assert [link.name for link in fitted.links] == [link.name for link in source.links]
-    for link, before in zip(fitted.links, source.links, strict=True):
-        if before.inertial is None:
-            assert link.inertial is None or link.inertial.mass == 0
-            continue
-        assert link.inertial.mass == pytest.approx(before.inertial.mass, rel=1e-9)
-        np.testing.assert_allclose(link.inertial.com, before.inertial.com, atol=1e-9)
-        np.testing.assert_allclose(
-            link.inertial.inertia, before.inertial.inertia, rtol=1e-6, atol=1e-12
-        )
 
 
 def test_part_made_of_primitives_keeps_them(run, ok):
@@ -109,42 +96,11 @@ def test_a_bundle_is_fitted_link_by_link(run, ok, meshed, tmp_path):
     fitted, source = read_bundle(tmp_path / "made"), read_bundle(tmp_path / meshed)
     assert meshes_of(tmp_path / "made", "collision") == []
     assert len(meshes_of(tmp_path / "made", "visual")) == 3
-    assert_same_inertials(fitted, source)
     assert (fitted.name, fitted.home, fitted.frames) == ("made", source.home, source.frames)
     assert replace(fitted, name="x").joints == source.joints
     assert run("check", "made")[0] == 0
-    assert run("check", meshed)[0] == 0
     card = json.loads((tmp_path / "made" / "card.json").read_text())
     assert {link["link"] for link in card["primitives"]["links"]} == set(rows) - {"mean"}
-
-
-@pytest.mark.slow
-def test_visual_option_replaces_visuals_and_keeps_their_colour(run, meshed, tmp_path):
-    words = ("fit", meshed, "--visual", "--out", "made", "--no-picture", "--configurations", "1")
-    assert run(*words)[0] == 0
-    assert meshes_of(tmp_path / "made", "visual") == []
-    assert not (tmp_path / "made" / "meshes").exists()
-    base = read_bundle(tmp_path / "made").link("base")
-    assert [shape.rgba for shape in base.visuals] == [(1.0, 0.0, 0.0, 1.0)]
-    assert [shape.geometry for shape in base.visuals] == [
-        shape.geometry for shape in base.collisions
-    ]
-
-
-def urdf_of(folder, *files):
-    """``robot.urdf``: links with one mesh each, side by side."""
-    links = "".join(
-        f'<link name="{path.stem}"><collision><geometry><mesh filename="{path.name}"/></geometry>'
-        "</collision></link>"
-        for path in files
-    )
-    joints = "".join(
-        f'<joint name="to_{path.stem}" type="fixed"><parent link="{files[0].stem}"/>'
-        f'<child link="{path.stem}"/></joint>'
-        for path in files[1:]
-    )
-    (folder / "robot.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
-    return "robot.urdf"
 
 
 def flat(path):
@@ -152,19 +108,20 @@ def flat(path):
     return path
 
 
-@pytest.mark.parametrize("output", [(), ("--json",)])
-def test_flat_link_is_reported_and_the_others_are_fitted(ok, box, tmp_path, output):
-    urdf = urdf_of(tmp_path, box, flat(tmp_path / "leaf.obj"))
-    out = ok("fit", urdf, *output)
-    if output:
-        data = json.loads(out)
-        assert [link["link"] for link in data["links"]] == ["link"]
-        (flat_finding,) = data["findings"]
-        assert (flat_finding["code"], flat_finding["where"]) == ("no-primitive", "link leaf")
-    else:
-        _, _, row, _, finding = out.splitlines()
-        assert row.split()[:2] == ["link", "box"]
-        assert finding.startswith("warning no-primitive at link leaf: ")
+def test_flat_link_is_reported_and_the_others_are_fitted(ok, box, tmp_path):
+    flat(tmp_path / "leaf.obj")
+    shape = "<collision><geometry><mesh filename='{}'/></geometry></collision>".format
+    Path("robot.urdf").write_text(
+        f"<robot name='r'><link name='link'>{shape(box)}</link>"
+        f"<link name='leaf'>{shape('leaf.obj')}</link><joint name='j' type='fixed'>"
+        "<parent link='link'/><child link='leaf'/></joint></robot>"
+    )
+    _, _, row, _, finding = ok("fit", "robot.urdf").splitlines()
+    assert row.split()[:2] == ["link", "box"]
+    assert finding.startswith("warning no-primitive at link leaf: ")
+    data = json.loads(ok("fit", "robot.urdf", "--json"))
+    assert [link["link"] for link in data["links"]] == ["link"]
+    assert [(f["code"], f["where"]) for f in data["findings"]] == [("no-primitive", "link leaf")]
 
 
 @pytest.mark.parametrize("source", ["plane", "robot"])
@@ -181,19 +138,6 @@ def test_folder_that_is_not_a_bundle_is_rejected_before_fitting(
 @pytest.mark.parametrize("named", ["source", "source/", "./source", "source/robot.urdf"])
 def test_bundle_is_not_overwritten_by_its_own_fit(refused, meshed, named):
     assert "is the robot itself" in refused("fit", named, "--out", "source", "--no-picture")
-
-
-FIGURES = {
-    "iou",
-    "coverage",
-    "volume_ratio",
-    "protrusion_share",
-    "protrusion_mean",
-    "protrusion_p95",
-    "gap_mean",
-    "gap_p95",
-    "hausdorff",
-}
 
 
 @pytest.fixture
@@ -229,30 +173,18 @@ def test_mesh_fit_as_json_is_in_metres(run, ok, box):
     np.testing.assert_allclose(sorted(primitive["box"]), (0.1, 0.2, 0.3), rtol=0.02)
     np.testing.assert_allclose(primitive["xyz"], (1.0, 2.0, 3.0), atol=2e-3)
     assert np.linalg.norm(primitive["quaternion"]) == pytest.approx(1.0)
-    assert set(data["quality"]) == FIGURES
+    assert set(data["quality"]) == {each.name for each in fields(Quality)}
     assert data["quality"]["iou"] > 0.97
     again = json.loads(run("fit", box, "--json", "--seed", "3")[1])
     assert {**again, "seconds": 0} == {**data, "seconds": 0}
 
 
 @pytest.mark.slow
-def test_more_primitives_are_fitted_until_the_iou_is_reached(ok, angle):
-    out = ok("fit", angle, "--max-primitives", "3", "--iou", "0.95", "--json")
-    data = json.loads(out)
-    assert [set(each) & {"box", "cylinder", "sphere"} for each in data["primitives"]] == [
-        {"box"}
-    ] * 2
-    assert data["quality"]["iou"] > 0.95
-    out = ok("fit", angle, "--max-primitives", "3", "--iou", "0.3", "--json")
-    assert len(json.loads(out)["primitives"]) == 1
-
-
-def test_enclosing_primitives_cover_the_whole_mesh(ok, angle):
-    out = ok("fit", angle, "--enclose", "--json")
-    data = json.loads(out)
-    assert data["quality"]["coverage"] == 1.0
-    assert data["quality"]["gap_p95"] < 1e-8
-    assert data["quality"]["iou"] < 0.8
+def test_options_of_a_mesh_fit_are_those_of_the_fit(ok, angle):
+    enclosed = json.loads(ok("fit", angle, "--enclose", "--json"))
+    assert enclosed["quality"]["coverage"] == 1.0
+    two = json.loads(ok("fit", angle, "--max-primitives", "3", "--iou", "0.95", "--json"))
+    assert ["box" in each for each in two["primitives"]] == [True, True]
 
 
 def test_mesh_fit_does_not_accept_out(refused, box):

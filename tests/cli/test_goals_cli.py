@@ -31,15 +31,8 @@ def cells(line):
 def test_table_has_one_row_per_goal_set(ok, path, goal_cache):
     out = ok("goals", path)
     head, _, *rows, last = out.splitlines()
-    assert head.split() == [
-        "robot",
-        "side",
-        "task",
-        "goals",
-        "acceptance",
-        "obstacles",
-        "certified",
-    ]
+    columns = ["robot", "side", "task", "goals", "acceptance", "obstacles", "certified"]
+    assert head.split() == columns
     assert [[cell.strip() for cell in cells(row)][:4] for row in rows] == [
         ["gantry-plane", "train", "reach", "100"],
         ["arm3-claw", "train", "reach", "100"],
@@ -58,9 +51,8 @@ def test_json_option_prints_only_json(run, ok, path):
     assert (first["robot"], first["side"], first["task"]) == ("gantry-plane", "train", "reach")
     assert (first["goals"], first["seed"], first["certified"]) == (100, 3, True)
     assert first["acceptance"] == first["accepted"] / first["tried"]
-    assert [one["certified"] for one in json.loads(run("goals", path, "--json")[1])["sets"]] == [
-        None
-    ] * 3
+    sets = json.loads(run("goals", path, "--json")[1])["sets"]
+    assert [one["certified"] for one in sets] == [None] * 3
 
 
 def test_robot_without_enough_goals_does_not_stop_the_others(run, tmp_path, monkeypatch):
@@ -82,10 +74,7 @@ def test_robot_without_enough_goals_does_not_stop_the_others(run, tmp_path, monk
 
 
 def test_unproven_goals_give_exit_code_1(run, path, monkeypatch):
-    lines = [
-        "goal 3: its configuration is in collision",
-        "goal 4: its configuration is in collision",
-    ]
+    lines = [f"goal {i}: its configuration is in collision" for i in (3, 4)]
     monkeypatch.setattr(TASKS["reach"], "certify", lambda *_: lines)
     assert run("goals", path)[0] == 0
     code, out, _ = run("goals", path, "--certify")
@@ -117,7 +106,5 @@ def test_single_robot_gets_push_goals_with_obstacles(ok):
 
 
 def test_split_folder_is_accepted_as_split(run, tmp_path):
-    folder = build_split(
-        some(), tmp_path / "data", LIBRARY, settings=BuildSettings(light=True)
-    ).folder
-    assert run("goals", folder)[1].endswith("3 of 3 goal sets are complete, seed 0\n")
+    built = build_split(some(), tmp_path / "data", LIBRARY, settings=BuildSettings(light=True))
+    assert run("goals", built.folder)[1].endswith("3 of 3 goal sets are complete, seed 0\n")

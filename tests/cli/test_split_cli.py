@@ -6,13 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import yaml
 
 from helpers.commands import tree
 from helpers.splits import TEST, TRAIN, combined, member, split
 from morphgen.benchmark.split_folder import load_split_folder
 from morphgen.benchmark.survey import paper_rows
-from morphgen.grammar.library import LIBRARY_VARIABLE
 from morphgen.splits.split import split_id
 from morphgen.splits.split_file import read_split, split_names, split_text
 from morphgen.tasks.goals.split_goals import read_goals
@@ -109,16 +107,8 @@ def test_new_prints_a_summary_and_the_next_command(run, tmp_path):
 def test_every_regime_can_be_created(run, argv, name, counts):
     data = json.loads(run(*argv, "--json")[1])
     split = read_split(f"{name}.yaml")
-    assert data == [
-        {
-            "file": f"{name}.yaml",
-            "name": name,
-            "id": split_id(split),
-            "train": counts[0],
-            "test": counts[1],
-            "restricted": [],
-        }
-    ]
+    written = {"file": f"{name}.yaml", "name": name, "id": split_id(split), "restricted": []}
+    assert data == [written | dict(zip(("train", "test"), counts, strict=True))]
     assert (len(split.train), len(split.test)) == counts
 
 
@@ -137,12 +127,8 @@ def test_a_hold_out_split_says_what_it_lacks_and_passes_its_audit(run, ok):
     before = Path("my/no-kinova.yaml").read_bytes()
     assert run(*words, "--out", "again.yaml")[0] == 0
     assert Path("again.yaml").read_bytes() == before
-    code, out, _ = run("split", "audit", "my/no-kinova.yaml", "--strict")
-    assert (code, out.splitlines()[-1]) == (
-        0,
-        "my/no-kinova: passed: 0 error, 0 warning, 0 accepted",
-    )
-    assert run("split", "verify", "my/no-kinova.yaml")[0] == 0
+    out = ok("split", "audit", "my/no-kinova.yaml", "--strict")
+    assert out.endswith("my/no-kinova: passed: 0 error, 0 warning, 0 accepted\n")
 
 
 def test_a_new_split_names_what_a_release_of_it_must_allow(run, ok):
@@ -192,18 +178,6 @@ def test_duplicate_train_robots_are_reported(run):
     repeated = 5 - len({member.robot_hash for member in split.train})
     assert repeated > 2
     assert f"  {repeated} train robots have the body and task of an earlier one\n" in out
-
-
-def test_parts_and_grammars_are_read_from_the_user_library(run, monkeypatch):
-    Path("lib").mkdir()
-    Path("lib/mine.grammar").write_text("robot -> gantry plane(size=uniform(0.1, 0.3))\n")
-    words = ("split", "new", "interpolation", "--grammar", "mine", "--train", 2)
-    assert run(*words, "--library", "lib", "--out", "a.yaml")[0] == 0
-    monkeypatch.setenv(LIBRARY_VARIABLE, str(Path("lib").absolute()))
-    assert run(*words, "--out", "b.yaml")[0] == 0
-    assert Path("a.yaml").read_bytes() == Path("b.yaml").read_bytes()
-    data = yaml.safe_load(Path("a.yaml").read_text())
-    assert list(data["made"]["grammar"]) == ["mine"]
 
 
 def test_existing_split_file_is_never_replaced(run, refused):
@@ -261,6 +235,12 @@ def test_leaky_split_fails_the_audit_with_reasons(run, write):
     for line in ("error body-near (1)", "error combination-seen (2)", "error part-unseen (1)"):
         assert line in lines
     assert lines[-1] == "mine/some: FAILED: 5 error, 0 warning, 0 accepted"
+    code, out, err = run("split", "audit", "some.yaml", "--json")
+    data = json.loads(out)
+    assert (code, err, data["split"], data["passed"]) == (1, "", "mine/some", False)
+    codes = {"body-shared", "body-near", "combination-seen", "part-unseen"}
+    assert {each["code"] for each in data["findings"]} == codes
+    assert data["nearest"]["twin"]["tree"] == {"train": "gantry-plane", "value": 0.0}
 
 
 def test_near_option_sets_the_audit_thresholds(run, write):
@@ -284,20 +264,6 @@ def test_long_lists_of_findings_are_shortened(run, write):
     assert lines[i + 11] == "  and 4 more (--json lists all)"
 
 
-def test_audit_json_option_prints_only_json(run, write):
-    code, out, err = run("split", "audit", write(leaky()), "--json")
-    assert (code, err) == (1, "")
-    data = json.loads(out)
-    assert (data["split"], data["passed"]) == ("mine/some", False)
-    assert {each["code"] for each in data["findings"]} == {
-        "body-shared",
-        "body-near",
-        "combination-seen",
-        "part-unseen",
-    }
-    assert data["nearest"]["twin"]["tree"] == {"train": "gantry-plane", "value": 0.0}
-
-
 def test_build_prints_its_folder_and_passes_verify(ok, write):
     path = write(combined())
     out = ok("split", "build", path, "--light")
@@ -313,13 +279,6 @@ def test_build_prints_its_folder_and_passes_verify(ok, write):
     for what in (path, "data/mine/some"):
         out = ok("split", "verify", what)
         assert out == f"mine/some, id {split_id(combined())}: all 4 robots are the same\n"
-
-
-def test_a_part_that_the_library_lacks_is_named(run, write):
-    wrong = replace(member(TRAIN[1]), derivation="base=planar[top: ee=cubw]")
-    code, _, err = run("split", "build", write(combined(train=[wrong])), "--out", "out")
-    assert (code, err.count("\n")) == (2, 1)
-    assert "unknown part 'cubw'; did you mean 'cube'?" in err
 
 
 def test_verify_prints_differences_per_robot(run, write):
@@ -341,14 +300,9 @@ def test_verify_prints_differences_per_robot(run, write):
 def test_stats_shows_the_figures_of_the_paper(ok):
     out = ok("split", "stats", "composition/ee-task", "extrapolation/primitives/reach")
     _, _, task, primitives, _, _, source = out.splitlines()
-    assert [cell.strip() for cell in task.split("  ") if cell][:6] == [
-        "composition/ee-task",
-        "4",
-        "1",
-        "7.75 (7.75)",
-        "5.25 (5.25)",
-        "5.25 (-)",
-    ]
+    cells = [cell.strip() for cell in task.split("  ") if cell]
+    assert cells[:3] == ["composition/ee-task", "4", "1"]
+    assert cells[3:6] == ["7.75 (7.75)", "5.25 (5.25)", "5.25 (-)"]
     assert "6.6 (6.6)" in primitives
     assert "(0.45)" in primitives
     assert "arXiv 2505.14986" in source
@@ -403,9 +357,8 @@ def test_goal_seed_is_printed_stored_and_audited(run, ok, write):
     assert {one.seed for one in read_goals("data/mine/some", "train").values()} == {7}
     assert run("split", "audit", "data/mine/some")[0] == 0
     code, out, _ = run("split", "audit", "data/mine/some", "--goal-seed", "0")
-    assert code == 1
-    i = out.splitlines().index("error goals-seed (4)")
-    assert out.splitlines()[i + 1].endswith("its set was made with seed 7, the split's with 0")
+    assert (code, "error goals-seed (4)" in out) == (1, True)
+    assert "its set was made with seed 7, the split's with 0" in out
 
 
 @pytest.mark.usefixtures("goal_cache")
@@ -418,16 +371,6 @@ def test_goals_are_audited_only_if_stored_or_requested(run, write):
     for words in ((path, "--goals"), ("data/mine/some", "--goals")):
         code, out, _ = run("split", "audit", *words)
         assert code == 1
-        i = out.splitlines().index("error goals-shared (1)")
-        assert out.splitlines()[i + 1] == (
-            "  test robot twin: train robot gantry-plane has 100 of its 100 goals"
-        )
+        why = "  test robot twin: train robot gantry-plane has 100 of its 100 goals"
+        assert f"error goals-shared (1)\n{why}\n" in out
         assert "5 goal sets were audited, seed 0" in out
-
-
-@pytest.mark.usefixtures("goal_cache")
-def test_accepted_findings_do_not_fail(ok, write):
-    accepted = {"body-shared": "one", "combination-seen": "two", "goals-shared": "three"}
-    out = ok("split", "audit", write(known(accepted=accepted)), "--goals", "--strict")
-    assert "accepted goals-shared (1): three" in out.splitlines()
-    assert out.splitlines()[-1] == "mine/some: passed: 0 error, 0 warning, 3 accepted"
