@@ -305,10 +305,8 @@ def test_a_structure_has_parts_and_counts_but_no_sizes_and_labels():
     other = "arm=ur5 ee=hand ee.fingers=4"
     assert structure(derivation(other), LIBRARY) != structure(derivation(other[:-1] + "5"), LIBRARY)
     assert combination(derivation(other)) == combination(derivation(other[:-1] + "5"))
-    named, bare = (
-        derivation("arm=ur5 ee=tongs"),
-        parse_derivation("base=fixed[top: arm=ur5[flange: ee=tongs]]"),
-    )
+    named = derivation("arm=ur5 ee=tongs")
+    bare = parse_derivation("base=fixed[top: arm=ur5[flange: ee=tongs]]")
     assert structure(bare, LIBRARY) == structure(named, LIBRARY)  # omitted counts are defaults
     assert parameters(bare, LIBRARY) == parameters(named, LIBRARY)
 
@@ -359,14 +357,36 @@ def test_points_inside_the_hull_agree_with_a_delaunay_triangulation(seed, d, n, 
 
 
 ARM3 = "arm=arm3 arm.length={} ee=claw"
+SHORT, LONG = member("a", ARM3.format(0.1)), member("b", ARM3.format(0.4))
+UR5, LWR = member("a", "arm=ur5 ee=plane"), member("b", "arm=lwr ee=stick")
+PUSHING = [
+    member("a", "base=gantry ee=plane", "push"),
+    member("b", "arm=ur5 ee=stick"),
+    member("c", "arm=lwr ee=stick"),
+]
+CUBE = member("d", "arm=ur5 ee=cube", "push")
+NLINK = [member("a", "nlink links=3", category="nlink"), member("b", "arm=ur5")]
+RULES = [
+    ("interpolation", [SHORT, LONG], (ARM3.format(0.3),), []),
+    ("interpolation", [SHORT, LONG], ("arm=arm5 ee=claw",), ["structure-unseen"]),
+    ("interpolation", [SHORT, LONG], ("arm=arm3 arm.wrist=0 ee=claw",), ["structure-unseen"]),
+    ("composition", [UR5, LWR], ("arm=ur5 ee=stick",), []),
+    ("composition", [UR5, LWR], ("arm=ur5 ee=cube",), ["part-unseen"]),
+    ("composition", [UR5, LWR], ("arm=ur5 ee=plane ee.size=0.3",), ["combination-seen"]),
+    ("composition", PUSHING, ("arm=ur5 ee=plane", "push"), []),
+    ("composition", PUSHING, ("arm=ur5 ee=stick", "push"), ["combination-seen"]),
+    ("composition", [*PUSHING, CUBE], ("arm=ur5 ee=plane", "push"), ["pair-seen"]),
+    ("composition", [*PUSHING, CUBE], ("arm=ur5 ee=plane", "reach"), []),
+    ("extrapolation", NLINK, ("chain", "reach", "chain"), []),
+    ("extrapolation", NLINK, ("nlink links=4", "reach", "nlink"), ["category-seen"]),
+    ("extrapolation", NLINK, ("nlink links=3", "reach", "mine"), ["structure-seen"]),
+    ("extrapolation", NLINK, ("arm=lwr",), []),  # composed is no category
+]
 
 
-def test_interpolation_requires_a_trained_structure():
-    train = [member("a", ARM3.format(0.1)), member("b", ARM3.format(0.4))]
-    assert codes("interpolation", train, [member("t", ARM3.format(0.3))]) == []
-    assert codes("interpolation", train, [member("t", "arm=arm5 ee=claw")]) == ["structure-unseen"]
-    counted = [member("t", "arm=arm3 arm.wrist=0 ee=claw")]
-    assert codes("interpolation", train, counted) == ["structure-unseen"]
+@pytest.mark.parametrize(("regime", "train", "test", "expected"), RULES)
+def test_each_regime_has_its_rules(regime, train, test, expected):
+    assert codes(regime, train, [member("t", *test)]) == expected
 
 
 @pytest.mark.parametrize(
@@ -381,47 +401,13 @@ def test_interpolation_requires_a_trained_structure():
     ],
 )
 def test_interpolation_requires_parameters_within_the_hull(length, hull, expected):
-    train = [member("a", ARM3.format(0.1)), member("b", ARM3.format(0.4)), member("c", "arm=ur5")]
-    test = [member("t", ARM3.format(length))]
+    train, test = [SHORT, LONG, member("c", "arm=ur5")], [member("t", ARM3.format(length))]
     assert codes("interpolation", train, test, hull=hull) == expected
     assert codes("interpolation", train, test) == []
 
 
-def test_composition_requires_trained_parts_in_a_new_combination():
-    train = [member("a", "arm=ur5 ee=plane"), member("b", "arm=lwr ee=stick")]
-    assert codes("composition", train, [member("t", "arm=ur5 ee=stick")]) == []
-    assert codes("composition", train, [member("t", "arm=ur5 ee=cube")]) == ["part-unseen"]
-    sized = [member("t", "arm=ur5 ee=plane ee.size=0.3")]
-    assert codes("composition", train, sized) == ["combination-seen"]
-
-
-def test_composition_with_tasks_requires_a_new_pair_of_robot_and_task():
-    train = [
-        member("a", "base=gantry ee=plane", "push"),
-        member("b", "arm=ur5 ee=stick", "reach"),
-        member("c", "arm=lwr ee=stick", "reach"),
-    ]
-    assert codes("composition", train, [member("t", "arm=ur5 ee=plane", "push")]) == []
-    pushing = [*train, member("d", "arm=ur5 ee=cube", "push")]
-    assert codes("composition", pushing, [member("t", "arm=ur5 ee=plane", "push")]) == ["pair-seen"]
-    assert codes("composition", pushing, [member("t", "arm=ur5 ee=plane", "reach")]) == []
-    seen = [member("t", "arm=ur5 ee=stick", "push")]
-    assert codes("composition", train, seen) == ["combination-seen"]
-
-
-def test_extrapolation_requires_a_new_category_and_structure():
-    train = [member("a", "nlink links=3", category="nlink"), member("b", "arm=ur5")]
-    assert codes("extrapolation", train, [member("t", "chain", category="chain")]) == []
-    same = [member("t", "nlink links=4", category="nlink")]
-    assert codes("extrapolation", train, same) == ["category-seen"]
-    same = [member("t", "nlink links=3", category="mine")]
-    assert codes("extrapolation", train, same) == ["structure-seen"]
-    assert codes("extrapolation", train, [member("t", "arm=lwr")]) == [], "composed is no category"
-
-
 @pytest.mark.parametrize("regime", ["interpolation", "extrapolation", "composition"])
 def test_a_test_task_must_be_trained(regime):
-    train = [member("a", "arm=ur5 ee=plane"), member("b", "arm=lwr ee=stick")]
-    test = [member("t", "arm=ur5 ee=stick", "push")]
-    assert "task-unseen" in codes(regime, train, test)
-    assert "task-unseen" not in codes(regime, train, [replace(test[0], task="reach")])
+    test = member("t", "arm=ur5 ee=stick", "push")
+    assert "task-unseen" in codes(regime, [UR5, LWR], [test])
+    assert "task-unseen" not in codes(regime, [UR5, LWR], [replace(test, task="reach")])

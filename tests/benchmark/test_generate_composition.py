@@ -13,28 +13,13 @@ from morphgen.benchmark.generate import (
     hold_out_combinations,
     num_covering,
 )
-from morphgen.benchmark.regimes import RuledRobot, expand, parts, regime_findings, structure
+from morphgen.benchmark.regimes import RuledRobot, expand, regime_findings, structure
 from morphgen.errors import BenchmarkError, CompositionError, PartError
 from morphgen.grammar.derivation import Derivation, parse_derivation
 
 pytestmark = pytest.mark.usefixtures("composed_once")
 
 FROM = ["arm={ur5,lwr,xarm7} ee={plane,stick,cylinder}"]
-
-
-@pytest.mark.slow
-def test_composition_holds_out_combinations_whose_parts_are_trained():
-    for seed in range(3):
-        (split,) = composition(order(6, test=2, seed=seed, tasks=("push",)), FROM, LIBRARY)
-        trained = [parts(d) for d in derivations(split.train)]
-        for own in map(parts, derivations(split.test)):
-            assert own not in trained
-            assert own <= frozenset().union(*trained)
-        assert (len(split.train), len(split.test)) == (6, 2)
-        assert {m.task for m in split.train} == {"push"}
-        assert {m.category for m in split.train} == {"composed"}
-        assert regime_findings(split, LIBRARY) == ()
-    require_sound(split)
 
 
 def test_without_a_size_all_admissible_robots_are_trained():

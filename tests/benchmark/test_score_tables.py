@@ -2,7 +2,6 @@
 
 import gzip
 import json
-import math
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from morphgen.benchmark.scores.submission import (
     submission_from,
 )
 from morphgen.errors import BenchmarkError
-from morphgen.rl.scores import mean_interval
+from morphgen.rl.scores import mean_interval, success_interval
 from morphgen.splits.split import split_id
 from morphgen.splits.split_file import read_split
 
@@ -41,15 +40,6 @@ def by_key(rows):
     return {(row.task, row.method, row.mode, row.finetuned): row for row in rows}
 
 
-def wilson(successes, trials, z=1.959964):
-    middle = (successes + z * z / 2) / (trials + z * z)
-    rate = successes / trials
-    half = (
-        z * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials**2)) / (1 + z * z / trials)
-    )
-    return middle - half, middle + half
-
-
 def test_a_row_has_all_seeds_of_a_method_and_the_difference_to_the_reference():
     first = data(successes=4, near=150.0) | {"training": TRAINING}
     second = data(successes=3, near=130.0) | {"training": TRAINING, "training_seed": 1}
@@ -63,10 +53,10 @@ def test_a_row_has_all_seeds_of_a_method_and_the_difference_to_the_reference():
         assert robots.episodes == trials, side
         assert robots.mean == pytest.approx(np.mean(scores))
         assert robots.iqm.low <= robots.iqm.value <= robots.iqm.high
-        low, high = wilson(7 * robots.robots, trials)
+        wilson = success_interval(7 / 8, trials)
         successes = [[[True] * 4] * robots.robots, [[True] * 3 + [False]] * robots.robots]
         of_seeds = mean_interval(successes)
-        ends = min(low, of_seeds.low), max(high, of_seeds.high)
+        ends = min(wilson.low, of_seeds.low), max(wilson.high, of_seeds.high)
         assert (robots.success.low, robots.success.high) == pytest.approx(ends, abs=1e-6)
         assert of_seeds.low <= 0.75 < 1 <= of_seeds.high  # from the worse seed to the better one
         assert robots.difference.value == pytest.approx(
@@ -91,16 +81,11 @@ def test_modes_and_fine_tuning_have_rows_of_their_own():
     tuned["robots"] = [robot for robot in tuned["robots"] if robot["side"] == "test"]
     stochastic = data() | {"mode": "stochastic"}
     rows = result_rows(read(a=data(), b=tuned, c=stochastic))
-    keys = [(row.mode, row.finetuned, list(row.sides)) for row in rows if row.task == "reach"]
-    both = ["train", "test"]
-    assert keys == [
-        ("deterministic", 0, both),
-        ("deterministic", 10_000, ["test"]),
-        ("stochastic", 0, both),
-    ]
-    lines = result_tables(rows).splitlines()
-    assert any("10,000" in line for line in lines)
-    assert any("ours (stochastic)" in line for line in lines)
+    modes = ["deterministic", "deterministic", "stochastic"]
+    assert [(row.mode, row.finetuned) for row in rows] == [*zip(modes, (0, 10_000, 0), strict=True)]
+    assert [list(row.sides) for row in rows] == [["train", "test"], ["test"], ["train", "test"]]
+    text = result_tables(rows)
+    assert ("10,000" in text, "ours (stochastic)" in text) == (True, True)
     assert result_tables(rows, "github").startswith("## ")
 
 
@@ -115,11 +100,8 @@ def test_runs_of_other_trainings_have_rows_of_their_own():
         name: data() | {"training_seed": seed, "training": training}
         for seed, (name, training) in enumerate({"a": TRAINING, "b": longer, "c": TRAINING}.items())
     }
-    rows = [row for row in result_rows(read(**files)) if row.task == "reach"]
-    assert [(row.transitions, row.seeds) for row in rows] == [
-        (30_000_000, (0, 2)),
-        (100_000_000, (1,)),
-    ]
+    runs = [(row.transitions, row.seeds) for row in result_rows(read(**files))]
+    assert runs == [(30_000_000, (0, 2)), (100_000_000, (1,))]
 
 
 def test_small_scores_have_two_decimals():
@@ -133,44 +115,32 @@ def test_a_run_that_two_studies_have_counts_once():
     assert result_rows(read(a=data(), b=data(), c=floor(), d=floor())) == one
 
 
-SHIPPED = read_split("interpolation/arm3/reach")
+FEWER = {"evaluation": data()["evaluation"] | {"episodes": 3}}
 
 
 @pytest.mark.parametrize(
-    ("files", "why"),
+    ("second", "why"),
     [
+        (data(near=140.0), "the same run, seed and mode as a with other episodes; name one of the"),
+        (data("b") | {"split": {"name": SPLIT.name, "id": "x"}}, "split.id x; expected"),
+        (data("b") | FEWER, "evaluation.episodes 3; expected 4, as in a; scores of different"),
+        (changed(data() | {"training_seed": 1}, robot="c"), ".*its seeds have other train robots"),
         (
-            {"a": data(), "b": data(near=140.0)},
-            "b: the same run, seed and mode as a with other episodes; name one of the two files",
-        ),
-        (
-            {"a": data(), "b": data("other") | {"split": {"name": SPLIT.name, "id": "x"}}},
-            "b: split.id x; expected",
-        ),
-        (
-            {
-                "a": data(),
-                "b": data("other") | {"evaluation": data()["evaluation"] | {"episodes": 3}},
-            },
-            "b: evaluation.episodes 3; expected 4, as in a; scores of different",
-        ),
-        (
-            {"a": data() | {"split": {"name": SHIPPED.name, "id": split_id(SHIPPED)}}},
-            f"a: train robot .*: body .*; expected a robot of {SHIPPED.name}",
-        ),
-        (
-            {"a": data(), "b": changed(data() | {"training_seed": 1}, robot="another")},
-            "its seeds have other train robots",
-        ),
-        (
-            {"a": data(), "b": changed(data("other"), random_score=[-500.0, -501, -500, -499])},
-            "b: train robot .*: random_score: mean -500.00; expected .*, as in a",
+            changed(data("b"), random_score=[-500.0, -501, -500, -499]),
+            "train robot .*: random_score: mean -500.00; expected .*, as in a",
         ),
     ],
 )
-def test_submissions_that_do_not_compare_are_refused(files, why):
-    with pytest.raises(BenchmarkError, match=why):
-        result_rows(read(**files))
+def test_submissions_that_do_not_compare_are_refused(second, why):
+    with pytest.raises(BenchmarkError, match=f"b: {why}"):
+        result_rows(read(a=data(), b=second))
+
+
+def test_robots_that_a_shipped_split_does_not_have_are_refused():
+    shipped = read_split("interpolation/arm3/reach")
+    values = data() | {"split": {"name": shipped.name, "id": split_id(shipped)}}
+    with pytest.raises(BenchmarkError, match=f"a: .*: body .*; expected a robot of {shipped.name}"):
+        result_rows(read(a=values))
 
 
 TUNED = {"training": {"simulator": "warp", "transitions": 30, "finetuned": 10_000}}
@@ -195,9 +165,8 @@ def table(tmp_path):
 
 def test_a_table_is_read_as_it_was_written_and_has_the_same_bytes_again(table, tmp_path):
     assert list(read_table(table)) == submissions()
-    assert [mode_of(each) for each in read_table(table)] == [
-        *("", "deterministic", "fine-tuned 10,000")
-    ]
+    modes = ["", "deterministic", "fine-tuned 10,000"]
+    assert [mode_of(each) for each in read_table(table)] == modes
     runs = ("ik", "ours seed0 deterministic", "ours seed0 fine-tuned 10,000")
     assert list(read_submissions([tmp_path])) == [f"{table}: mine/small {run}" for run in runs]
     content = table.read_bytes()

@@ -75,11 +75,8 @@ def test_a_release_holds_its_descriptions_and_hashes(report, folder):
         *("release.json", "robots", "robots.jsonl", "split.yaml", "tokens.npz", "difficulty.csv"),
     }
     release = read_release(folder)
-    assert (release.name, release.id, release.version) == (
-        "mine/some",
-        split_id(combined()),
-        "1.2.0",
-    )
+    assert (release.name, release.version) == ("mine/some", "1.2.0")
+    assert release.id == split_id(combined())
     assert release.evaluation == EvalProtocol().as_data(combined())
     assert set(release.difficulty["nearest"]) == {"planar-plane"}
     _, front, text = (folder / "README.md").read_text().split("---\n", 2)
@@ -199,9 +196,8 @@ def test_croissant_is_valid(folder):
     dataset = mlcroissant.Dataset(jsonld=folder / CROISSANT_FILE)
     assert dataset.metadata.ctx.issues.report() == ""
     robots = list(dataset.records("robots"))
-    assert [each["robots/name"].decode() for each in robots] == [
-        *("gantry-plane", "planar-cube", "gantry-cylinder", "planar-plane")
-    ]
+    names = [b"gantry-plane", b"planar-cube", b"gantry-cylinder", b"planar-plane"]
+    assert [each["robots/name"] for each in robots] == names
     assert [each["robots/side"] for each in robots] == [b"train"] * 3 + [b"test"]
     assert [each["sides/name"] for each in dataset.records("sides")] == ["train", "test"]
 
@@ -229,9 +225,7 @@ def test_another_content_of_the_same_version_is_refused(tmp_path):
 
 def test_leaky_splits_and_restricted_parts_are_not_released(tmp_path):
     leaky = combined(test=[*TEST, member(TRAIN[0], "twin")])
-    with pytest.raises(
-        BenchmarkError, match="mine/some fails its audit: body-shared at test robot"
-    ):
+    with pytest.raises(BenchmarkError, match="fails its audit: body-shared at test robot"):
         release_split(leaky, tmp_path / "out", LIBRARY, LIGHT)
     limited = combined(train=[*TRAIN, "base=gantry ee=sake_ez"])
     with pytest.raises(BenchmarkError, match=r"sake_ez .*--licence-allow CC-BY-NC-ND-4.0"):

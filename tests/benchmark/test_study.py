@@ -96,10 +96,8 @@ def test_fine_tuning_is_added_to_finished_cells(whole, tmp_path):
     assert (submission.mode, submission.finetuned) == ("deterministic", steps)
     assert not equal(weights(tuned.folder / f"finetuned/{steps}"), weights(tuned.folder))
     write_tables(tmp_path, cells)
-    found = json.loads((tmp_path / DATA).read_text())["rows"]
-    assert [(row["method"], row["seeds"]) for row in found if row["finetuned"]] == [
-        ("me-mlp", [0, 1])
-    ]
+    rows = [row for row in json.loads((tmp_path / DATA).read_text())["rows"] if row["finetuned"]]
+    assert [(row["method"], row["seeds"]) for row in rows] == [("me-mlp", [0, 1])]
 
 
 def test_finished_cells_are_not_repeated(whole, monkeypatch):
@@ -212,12 +210,9 @@ def test_policies_of_single_robots_are_resampled_by_robot(whole):
     for agent in ("se", "me-mlp"):
         own = [stored_results(cell)["deterministic"] for cell in whole if cell.agent == agent]
         (row,) = result_rows({str(each.training_seed): each for each in own})
-        scores = [
-            [relative_scores(robot).mean() for robot in run.robots if robot.side == "train"]
-            for run in own
-        ]
-        expected = iqm_interval(scores, together=agent != "se")
-        assert row.sides["train"].iqm == expected
+        train = [[robot for robot in run.robots if robot.side == "train"] for run in own]
+        scores = [[relative_scores(robot).mean() for robot in robots] for robots in train]
+        assert row.sides["train"].iqm == iqm_interval(scores, together=agent != "se")
 
 
 def test_missing_and_diverged_episodes_are_named_under_the_table(whole, tmp_path):
@@ -235,9 +230,7 @@ def test_missing_and_diverged_episodes_are_named_under_the_table(whole, tmp_path
     name = "mine/small"
     missing = [f"{name} se seed 1", f"{name} me-mlp seed 0", f"{name} me-mlp seed 1"]
     assert json.loads((tmp_path / DATA).read_text())["missing"] == missing
-    assert [line for line in text.splitlines() if line.startswith("- missing")] == [
-        f"- missing: {each}" for each in missing
-    ]
+    assert re.findall("(?m)^- missing: (.*)$", text) == missing
     assert f"- {name} se seed0 stochastic: {UNSTABLE}: 1" in text
     few = [replace(cells[4], finetune=(10,))]
     write_tables(tmp_path, few)

@@ -3,7 +3,6 @@
 import json
 from dataclasses import fields, replace
 from pathlib import Path
-from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
@@ -20,38 +19,9 @@ from morphgen.formats.srdf import read_srdf
 from morphgen.formats.urdf.read import read_urdf
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
-from morphgen.model.geometry import Mesh, Pose, Shape, Sphere
-from morphgen.model.inertia import with_inertia
-from morphgen.model.robot import Link
+from morphgen.model.geometry import Box, Pose, Shape, Sphere
 
 pytestmark = pytest.mark.usefixtures("own_cache", "nothing_is_stored")
-
-
-@pytest.fixture
-def meshed(tmp_path):
-    """A bundle in ``source``: the arm with a box's mesh on its base and on both fingers."""
-    folder = tmp_path / "meshes"
-    folder.mkdir()
-    block, finger = trimesh.creation.box((0.1, 0.1, 0.04)), trimesh.creation.box((0.02, 0.01, 0.08))
-    block.export(folder / "block.stl")
-    finger.export(folder / "finger.stl")
-    red = (1.0, 0.0, 0.0, 1.0)
-    on_base = Shape(Mesh(folder / "block.stl"), rgba=red)
-    on_finger = Shape(Mesh(folder / "finger.stl"), Pose((0.0, 0.0, 0.05)), red)
-    shapes = {"base": on_base, "left": on_finger, "right": on_finger}
-    links = [
-        with_inertia(Link(name, visuals=(shape,), collisions=(shape,)), 2000.0)
-        for name, shape in shapes.items()
-    ]
-    return write_bundle(arm().with_links(links), tmp_path / "source", picture=False).relative_to(
-        tmp_path
-    )
-
-
-def meshes_of(folder, kind):
-    """File names of meshes in a bundle's URDF: ``collision`` or ``visual``."""
-    root = ElementTree.parse(folder / "robot.urdf").getroot()
-    return [mesh.get("filename") for mesh in root.findall(f"link/{kind}/geometry/mesh")]
 
 
 def test_part_made_of_primitives_keeps_them(run, ok):
@@ -82,43 +52,24 @@ def test_user_part_is_found_in_the_given_library(ok, tmp_path):
     assert {link["link"] for link in json.loads(out)["links"]} == names
 
 
-@pytest.mark.slow
-def test_a_bundle_is_fitted_link_by_link(run, ok, meshed, tmp_path):
-    out = ok("fit", meshed, "--out", "made", "--no-picture", "--configurations", "50")
-    lines = out.splitlines()
-    rows = {line.split()[0]: line.split() for line in lines[2:9]}
-    assert list(rows) == ["base", "upper", "lower", "slider", "left", "right", "mean"]
-    assert rows["base"][1:3] == ["box", "watertight"]
-    assert rows["upper"][1:3] == ["cylinder", "primitives"]
-    assert rows["right"][1:4] == ["box", "as", "left"]
-    assert "collisions in 50 random configurations" in out
-    assert lines[-1] == "made"
-    fitted, source = read_bundle(tmp_path / "made"), read_bundle(tmp_path / meshed)
-    assert meshes_of(tmp_path / "made", "collision") == []
-    assert len(meshes_of(tmp_path / "made", "visual")) == 3
-    assert (fitted.name, fitted.home, fitted.frames) == ("made", source.home, source.frames)
-    assert replace(fitted, name="x").joints == source.joints
-    assert run("check", "made")[0] == 0
-    card = json.loads((tmp_path / "made" / "card.json").read_text())
-    assert {link["link"] for link in card["primitives"]["links"]} == set(rows) - {"mean"}
-
-
-def flat(path):
-    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n")
-    return path
-
-
 def test_flat_link_is_reported_and_the_others_are_fitted(ok, box, tmp_path):
-    flat(tmp_path / "leaf.obj")
+    Path("leaf.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n")
     shape = "<collision><geometry><mesh filename='{}'/></geometry></collision>".format
     Path("robot.urdf").write_text(
         f"<robot name='r'><link name='link'>{shape(box)}</link>"
         f"<link name='leaf'>{shape('leaf.obj')}</link><joint name='j' type='fixed'>"
         "<parent link='link'/><child link='leaf'/></joint></robot>"
     )
-    _, _, row, _, finding = ok("fit", "robot.urdf").splitlines()
-    assert row.split()[:2] == ["link", "box"]
+    words = ("--out", "made", "--no-picture", "--configurations", "5")
+    out = ok("fit", "robot.urdf", *words)
+    _, _, row, _, finding, *_, folder = out.splitlines()
+    assert (row.split()[:2], folder) == (["link", "box"], "made")
     assert finding.startswith("warning no-primitive at link leaf: ")
+    assert "collisions in 5 random configurations" in out
+    card = json.loads(Path("made/card.json").read_text())
+    assert [link["link"] for link in card["primitives"]["links"]] == ["link"]
+    (collision,) = read_bundle(tmp_path / "made").link("link").collisions
+    assert isinstance(collision.geometry, Box)
     data = json.loads(ok("fit", "robot.urdf", "--json"))
     assert [link["link"] for link in data["links"]] == ["link"]
     assert [(f["code"], f["where"]) for f in data["findings"]] == [("no-primitive", "link leaf")]
@@ -136,7 +87,8 @@ def test_folder_that_is_not_a_bundle_is_rejected_before_fitting(
 
 
 @pytest.mark.parametrize("named", ["source", "source/", "./source", "source/robot.urdf"])
-def test_bundle_is_not_overwritten_by_its_own_fit(refused, meshed, named):
+def test_bundle_is_not_overwritten_by_its_own_fit(refused, named):
+    write_bundle(arm(), Path("source"), picture=False)
     assert "is the robot itself" in refused("fit", named, "--out", "source", "--no-picture")
 
 
@@ -256,22 +208,6 @@ def test_exports_have_the_same_spheres(ok, balls, tmp_path):
     }
     urdf = tmp_path / "arm-curobo" / kinematics["urdf_path"]
     assert spheres_of(read_urdf(urdf, written_frames=True)) == expected
-    ignored = kinematics["self_collision_ignore"]
-    for joint in arm().joints:
-        a, b = sorted((joint.parent, joint.child))
-        assert b in ignored[a]
-
-
-@pytest.mark.slow
-def test_curobo_has_eight_spheres_for_a_link_by_default_and_keeps_those_of_a_link(
-    ok, balls, tmp_path
-):
-    words = ("--format", "curobo", "--samples", "50", "--out", tmp_path)
-    ok("export", balls, *words)
-    config = yaml.safe_load((tmp_path / "arm-curobo" / "robot.yml").read_text())
-    spheres = config["robot_cfg"]["kinematics"]["collision_spheres"]
-    assert {link: len(of_link) for link, of_link in spheres.items()} == counts(8)
-    assert spheres["left"] == [{"center": [0.0, 0.0, 0.05], "radius": 0.02}]
 
 
 @pytest.mark.slow

@@ -116,19 +116,13 @@ def test_grammar_check_prints_sound_or_the_faults(run, mine):
     assert (code, len(json.loads(out))) == (1, 2)
 
 
-def test_grammar_count_prints_structures_and_random_values(run, mine):
-    code, out, _ = run("grammar", "count", mine)
-    assert (code, out.splitlines()) == (
-        0,
-        ["mine: 2 structures, 1 values drawn", "  continuous  ee: plane.size = uniform(5cm, 15cm)"],
-    )
-    assert json.loads(run("grammar", "count", mine, "--json")[1]) == {
-        "structures": 2,
-        "finite": True,
-        "variables": [
-            {"where": "ee: plane.size", "draw": "uniform(5cm, 15cm)", "continuous": True}
-        ],
-    }
+def test_grammar_count_prints_structures_and_random_values(ok, mine):
+    first, second = ok("grammar", "count", mine).splitlines()
+    assert first == "mine: 2 structures, 1 values drawn"
+    assert second == "  continuous  ee: plane.size = uniform(5cm, 15cm)"
+    size = {"where": "ee: plane.size", "draw": "uniform(5cm, 15cm)", "continuous": True}
+    data = json.loads(ok("grammar", "count", mine, "--json"))
+    assert data == {"structures": 2, "finite": True, "variables": [size]}
 
 
 def test_counts_without_a_number_are_named(run, mine):
@@ -146,24 +140,18 @@ def test_counts_without_a_number_are_named(run, mine):
     assert len(run("grammar", "enumerate", mine, "--limit", 4)[1].splitlines()) == 4
 
 
-def test_grammar_enumerate_prints_derivations_that_compose(run, ok, mine):
+def test_grammar_enumerate_prints_derivations_that_compose(ok, mine):
     out = ok("grammar", "enumerate", mine)
-    assert [line.split("ee=")[1] for line in out.splitlines()] == [
-        "plane(size=0.1, thickness=0.01)]",
-        "cube(size=0.1)]",
-    ]
-    assert json.loads(run("grammar", "enumerate", mine, "--limit", 1, "--json")[1]) == [
-        out.splitlines()[0]
-    ]
+    ends = ["plane(size=0.1, thickness=0.01)]", "cube(size=0.1)]"]
+    assert [line.split("ee=")[1] for line in out.splitlines()] == ends
+    first = json.loads(ok("grammar", "enumerate", mine, "--limit", 1, "--json"))
+    assert first == out.splitlines()[:1]
 
 
-def test_grammar_print_is_a_grammar_without_includes(run, mine):
+def test_grammar_print_is_a_grammar_without_includes(run, ok, mine):
     Path("more.grammar").write_text('include "mine.grammar"\nrobot -> slides down:ee\n')
-    code, out, _ = run("grammar", "print", "more.grammar")
-    assert (code, out.splitlines()) == (
-        0,
-        ["robot -> slides down:ee", "ee -> plane(size=uniform(5cm, 15cm)) | cube"],
-    )
+    out = ok("grammar", "print", "more.grammar")
+    assert out == "robot -> slides down:ee\nee -> plane(size=uniform(5cm, 15cm)) | cube\n"
     assert json.loads(run("grammar", "print", "more.grammar", "--json")[1]) == out
     mine.write_text(out)
     assert run("grammar", "print", mine)[1] == out
@@ -176,19 +164,12 @@ def test_derive_prints_one_line_per_part(run, cubes):
     assert text == (cubes / "cubes-000001" / "derivation.txt").read_text().strip()
 
 
-def test_derive_takes_words(run):
-    assert run("derive", "arm=ur5", "ee=plane")[:2] == run("derive", "ur5-plane")[:2]
-
-
 @pytest.mark.parametrize("geometry", ["primitive", "sphere"])
 def test_derive_reproduces_fitted_collision_shapes(run, geometry):
     words = ("--geometry", geometry, "--no-picture")
     assert run("compose", "base=gantry", "ee=plane", "--name", "it", *words)[0] == 0
-    assert run("derive", "robots/it", "--replay") == (
-        0,
-        "robots/it/robot.urdf: the same bytes\n",
-        "",
-    )
+    same = "robots/it/robot.urdf: the same bytes\n"
+    assert run("derive", "robots/it", "--replay") == (0, same, "")
 
 
 @pytest.mark.parametrize("light", [True, False])
@@ -219,14 +200,6 @@ def test_mutate_writes_neighbours_and_prints_their_changes(ok, cubes):
     ]
 
 
-def test_neighbours_meet_the_conditions_of_the_set(run, ok, tmp_path):
-    words = ("sample", "cubes", "-n", 1, "--light", "--where", "mass > 0.9", "--out", "set")
-    assert run(*words)[0] == 0
-    robot = "set/cubes-000000"
-    out = ok("mutate", robot, "-n", 8, "--no-picture", "--json")
-    assert all(read_bundle(Path(folder)).mass > 0.9 for folder in json.loads(out))
-
-
 @pytest.mark.parametrize(
     ("where", "refusal"),
     [
@@ -241,10 +214,6 @@ def test_mutate_refuses_settings_with_other_conditions(refused, cubes, where, re
     assert refusal in refused("mutate", cubes / "cubes-000002", "--no-picture")
 
 
-def test_mutate_rejects_robots_missing_from_the_index(refused, cubes):
-    assert "'cubes-000009' is not in the index of" in refused("mutate", cubes / "cubes-000009")
-
-
 def test_compose_follows_a_grammar(run):
     code, out, _ = run("compose", "chain", "beads=5", "bead.radius=0.02", "--no-picture")
     assert (code, out.splitlines()[0].split(": ")[1][:16]) == (0, "19 links, 13 DoF")
@@ -253,11 +222,6 @@ def test_compose_follows_a_grammar(run):
     assert read_bundle(folder).dof == 13
     card = json.loads((folder / "card.json").read_text())
     assert card["derivation"].count("radius=0.02") == 5
-
-
-def test_compose_follows_a_grammar_file(run, mine):
-    assert run("compose", mine, "ee=cube", "--no-picture", "--name", "x")[0] == 0
-    assert "ee_cube" in read_bundle(Path("robots/x")).link_index
 
 
 @pytest.mark.parametrize("by_environment", [True, False])

@@ -56,14 +56,8 @@ def link(expression):
 
 def test_known_command_execution_exploit_is_rejected(refused, hostile):
     path = hostile(link(CALL))
-    for words in (
-        ("show", path),
-        ("check", path),
-        ("fit", path),
-        ("tokens", path),
-        ("import", path, "--out", "robots"),
-    ):
-        message = refused(*words)
+    for command in ("show", "check", "fit", "tokens", "import"):
+        message = refused(command, path)
         assert f"{path}:2: name 'vars' is not defined when evaluating expression" in message
 
 
@@ -116,17 +110,10 @@ def test_yaml_is_read_only_from_the_file_folder(refused_at, hostile, tmp_path, n
         assert "--root DIR" in message
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "../secret.xml",
-        "{home}/secret.xml",
-        "link.xml",
-        "../*.xml",
-        "{home}/*",
-        "$(find home)/secret.xml",
-    ],
-)
+OUTSIDE = ("../secret.xml", "{home}/secret.xml", "link.xml", "../*.xml", "{home}/*")
+
+
+@pytest.mark.parametrize("name", [*OUTSIDE, "$(find home)/secret.xml"])
 def test_includes_are_read_only_from_the_file_folder(refused_at, hostile, tmp_path, name):
     (hostile("").parent / "link.xml").symlink_to(tmp_path / "home" / "secret.xml")
     name = name.format(home=tmp_path / "home")

@@ -34,16 +34,12 @@ def test_the_urdf_of_a_bundle_is_imported_with_its_frames(run, tmp_path):
 
 
 def test_a_tool_link_is_renamed_even_if_its_new_name_is_taken(run, tmp_path):
-    links = "".join(f'<link name="{name}"/>' for name in ("base", "tool_link", "tool"))
-    joints = "".join(
-        f'<joint name="{name}" type="fixed"><parent link="{parent}"/>'
-        f'<child link="{child}"/></joint>'
-        for name, parent, child in (
-            ("tool_link_joint", "base", "tool_link"),
-            ("tool_joint", "tool_link", "tool"),
-        )
+    (tmp_path / "arm.urdf").write_text(
+        "<robot name='arm'><link name='base'/><link name='tool_link'/><link name='tool'/>"
+        "<joint name='tool_link_joint' type='fixed'><parent link='base'/>"
+        "<child link='tool_link'/></joint><joint name='tool_joint' type='fixed'>"
+        "<parent link='tool_link'/><child link='tool'/></joint></robot>"
     )
-    (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{links}{joints}</robot>')
     assert run("import", "arm.urdf", "--no-picture")[0] == 0
     robot = morphgen.read(tmp_path / "robots" / "arm")
     assert [link.name for link in robot.links] == ["base", "tool_link", "tool_link_"]
@@ -80,10 +76,7 @@ def test_a_set_of_bodies_becomes_parts_and_the_refused_are_named(run, ok, tmp_pa
     assert code == 2
     assert err.count("\n") == 1
     assert "body_3.xml: joint" in err
-    assert "type ball" in err
-    assert sorted(path.name for path in (tmp_path / "parts").iterdir()) == [
-        *("body_1.yaml", "body_2.yaml")
-    ]
+    assert {path.name for path in (tmp_path / "parts").iterdir()} == {"body_1.yaml", "body_2.yaml"}
     (tmp_path / "set.grammar").write_text("robot -> body_1 | body_2\n")
     words = ("--library", "parts", "--train", "1", "--test", "1", "--name", "my/set")
     ok("split", "new", "--grammar", "set.grammar", "--hold-out", "body=body_2", *words)
@@ -106,13 +99,9 @@ def test_several_files_give_one_json_array_in_which_the_refused_have_a_reason(ru
     reasons = [each["message"] for each in objects[1:]]
     assert {each["error"] for each in objects[1:]} == {"FormatError"}
     assert err.splitlines() == [f"morphgen: {reason}" for reason in reasons]
-    for file, reason in zip(files[1:], reasons, strict=True):
+    parts = ("menagerie:no_such_robot: ", "type ball", "c.xml", "import its file alone")
+    for file, reason, part in zip(files[1:], reasons, parts, strict=True):
         assert file in reason
-    for reason, part in zip(
-        reasons,
-        ("menagerie:no_such_robot: ", "type ball", "c.xml", "import its file alone"),
-        strict=True,
-    ):
         assert part in reason
     code, out, _ = run("import", "a.xml", "a.xml", *words)  # a file named twice is one file
     one = json.loads(out)
@@ -128,9 +117,8 @@ def test_a_robot_of_the_menagerie_is_imported_with_its_licence(run, refused, tmp
     assert "licence: BSD-3-Clause" in (tmp_path / "parts" / "test.yaml").read_text()
     assert "no robot 'universal_robots_ur5'; did you mean" in refused("import", name[:-1])
     assert "no model 'scene'; valid: ur5e" in refused("import", f"{name}/scene")
-    assert "'agilex_piper' not found under MENAGERIE_ROOT" in refused(
-        "import", "menagerie:agilex_piper"
-    )
+    missing = refused("import", "menagerie:agilex_piper")
+    assert "'agilex_piper' not found under MENAGERIE_ROOT" in missing
 
 
 def test_a_module_of_robot_descriptions_names_its_file(refused, tmp_path, monkeypatch):
@@ -147,10 +135,9 @@ def test_a_module_of_robot_descriptions_names_its_file(refused, tmp_path, monkey
         monkeypatch.delitem(sys.modules, module)
     found = find_description("robot_descriptions:toy_description")
     assert (str(found.path), found.args, found.licence) == ("/toys/toy.xacro", {"length": "2"}, "")
-    assert "no such robot; did you mean 'toy_description'?" in refused(
-        "import", "robot_descriptions:toi_description"
-    )
-    assert "lost_description: cannot be loaded: no network" in refused(
-        "import", "robot_descriptions:lost_description"
-    )
+    for name, reason in (
+        ("toi_description", "no such robot; did you mean 'toy_description'?"),
+        ("lost_description", "lost_description: cannot be loaded: no network"),
+    ):
+        assert reason in refused("import", f"robot_descriptions:{name}")
     assert json.dumps(find_description("C:robot.xml").path.name) == '"C:robot.xml"'

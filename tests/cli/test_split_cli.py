@@ -58,14 +58,6 @@ def test_show_prints_one_row_per_robot(run):
     assert "{robots: 3, grammar: prims, pinned: prim=plane, seed: " in full
 
 
-def test_show_prints_json(run):
-    data = json.loads(run("split", "show", "extrapolation/arms/push", "--json")[1])
-    split = read_split("extrapolation/arms/push")
-    assert data["id"] == split_id(split)
-    assert data["train"][0]["derivation"] == split.train[0].derivation
-    assert data["statistics"] == split.statistics
-
-
 def test_new_prints_a_summary_and_the_next_command(run, tmp_path):
     code, out, err = run(*INTERPOLATION, "--seed", 4)
     name = "interpolation-cubes-reach-seed4"
@@ -318,14 +310,6 @@ def test_stats_merges_splits_with_the_same_robots(run, write):
     assert code == 0
     assert (row["robots"], row["splits"]) == ("mine/some", ["mine/some/push", "mine/some/reach"])
     assert (row["ours"]["train"]["robots"], row["paper"]) == (3, None)
-
-
-def test_stats_can_be_markdown(run, write):
-    _, out, _ = run("split", "stats", write(combined()), "--markdown")
-    header, rule, row = out.splitlines()[:3]
-    assert header.startswith("| robots")
-    assert set(rule) <= set("|-:")
-    assert row.startswith("| mine/some")
 
 
 @pytest.mark.slow

@@ -15,7 +15,6 @@ from helpers.simulators import PYBULLET
 from helpers.splits import member, split
 from morphgen.benchmark.scores.submission import read_table
 from morphgen.cli import progress
-from morphgen.grammar.library import default_library
 from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, read_config
 from morphgen.rl.runs.robot_source import FILE, fresh_source, members, read_drawn, specs_of
 from morphgen.rl.runs.training import METRICS, _StopRequest, read_metrics
@@ -24,8 +23,6 @@ from morphgen.splits.split import Member
 from morphgen.splits.split_file import write_split
 from morphgen.tasks.goals.split_goals import read_goals
 from morphgen.tasks.scenes.env_specs import GoalConfig
-from morphgen.viewer.robot_uri import DERIVATION, FileAccess
-from morphgen.viewer.simulation import training_robots
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
@@ -253,11 +250,7 @@ def test_study_prints_a_table(run, split_yaml, tmp_path):
         *("random", "zero", "jacobian", "ik", *policies),
         *("me-mlp-discrete", "me-mlp-discrete (stochastic)"),
     ]
-    before = tree(tmp_path / "study" / "mine")
-    code, again, _ = run(*words)
-    assert (code, again) == (0, out)
-    assert tree(tmp_path / "study" / "mine") == before
-    assert "another run: ppo.gamma 0.99, not 0.5" in run(*words, "--set", "gamma=0.5")[2]
+    assert run(*words)[:2] == (0, out)
     assert "of another evaluation" in run(*words, "--eval-steps", "600", "--report")[2]
 
 
@@ -326,11 +319,7 @@ def test_drawn_robots_are_trained_on_and_others_evaluated_and_played(run, ok, tm
     code, out, _ = run("play", "reach", "planar-cube", "--policy", folder, "--sim", "mujoco")
     assert (code, out[:10]) == (0, "episode 1:")
 
-    files = FileAccess(default_library().folders, (tmp_path,), tmp_path / "none")
-    listed = [(each.name, f"{DERIVATION}{each.derivation}") for each in robots]
-    assert training_robots(str(folder), files) == ("reach", False, listed)
     (folder / FILE).unlink()
-    assert training_robots(f"{folder}/checkpoint.pt", files) == ("reach", False, [])
     code, _, err = run("eval", folder, "--split", "own.yaml", "--on", "test", *evaluation)
     assert code == 0
     assert f"{folder} has no robots.json: it is unknown whether" in err

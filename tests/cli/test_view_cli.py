@@ -12,9 +12,7 @@ import pytest
 from websockets.exceptions import InvalidStatus
 
 from helpers.commands import start
-from helpers.robots import arm
 from helpers.viser_client import PlainClient
-from morphgen.formats.bundle import write_bundle
 
 
 def address(process):
@@ -26,20 +24,8 @@ def address(process):
 
 
 @pytest.mark.slow
-def test_bundle_is_served_until_interrupted(tmp_path):
-    write_bundle(arm(), tmp_path / "arm", picture=False)
-    viewing = start("view", tmp_path / "arm", "--port", "8931")
-    page = urllib.request.urlopen(address(viewing), timeout=60)
-    assert b"<html" in page.read().lower()
-    viewing.send_signal(signal.SIGINT)
-    _, errors = viewing.communicate(timeout=60)
-    assert viewing.returncode == 0
-    assert "Traceback" not in errors
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_uploads_are_deleted_on_every_signal(tmp_path, monkeypatch, end):
+def test_a_viewer_serves_until_a_signal_and_deletes_uploads(tmp_path, monkeypatch, end):
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     viewing = start("view", "--port", "8933")
     port = int(re.search(r":(\d+)", address(viewing))[1])
@@ -48,6 +34,8 @@ def test_uploads_are_deleted_on_every_signal(tmp_path, monkeypatch, end):
         client.sent_to()
     (folder,) = tmp_path.glob("morphgen-uploads-*")
     assert [path.name for path in folder.rglob("*.urdf")] == ["a.urdf"]
+    page = urllib.request.urlopen(f"http://localhost:{port}", timeout=60)
+    assert b"<html" in page.read().lower()
     viewing.send_signal(end)
     _, errors = viewing.communicate(timeout=60)
     assert (viewing.returncode, errors) == (0, "")

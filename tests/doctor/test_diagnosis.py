@@ -85,11 +85,10 @@ def test_json_has_every_result(monkeypatch, capsys):
     only(lambda: iter([Entry("a", "ok", "b", {"c": 1}), Entry("d", "error", "e")]), monkeypatch)
     assert main(["doctor", "--json"]) == 1
     data = json.loads(capsys.readouterr().out)
-    assert data["passed"] is False
-    assert [each["status"] for each in data["results"]] == ["ok", "error"]
-    assert data["results"][0] == {
-        "section": "part", "name": "a", "status": "ok", "text": "b", "data": {"c": 1}
-    }  # fmt: skip
+    first, second = data["results"]
+    assert (data["passed"], second["status"]) == (False, "error")
+    facts = {"section": "part", "name": "a", "status": "ok", "text": "b"}
+    assert first == facts | {"data": {"c": 1}}
 
 
 def test_an_error_makes_the_exit_code_1(monkeypatch, capsys):
@@ -143,11 +142,9 @@ DECLARED = declared(
 
 
 def test_an_extra_has_the_packages_of_the_extras_that_it_includes():
-    names = {
-        extra: [each.name for each in system._requirements(extra, DECLARED)]
-        for extra in ("", "fit", "rl", "pybullet")
-    }
-    assert names == {"": ["numpy"], "fit": ["torch"], "rl": ["gymnasium", "torch"], "pybullet": []}
+    names = {"": ["numpy"], "fit": ["torch"], "rl": ["gymnasium", "torch"], "pybullet": []}
+    for extra, expected in names.items():
+        assert [each.name for each in system._requirements(extra, DECLARED)] == expected
 
 
 def test_packages_outside_their_ranges_and_missing_ones_are_named():
@@ -158,10 +155,8 @@ def test_packages_outside_their_ranges_and_missing_ones_are_named():
     assert (absent.status, absent.data[missing]) == ("absent", None)
     assert absent.text == f"not installed: {missing}; pip install 'morphgen[rl]'"
     (core,) = system._group("core", declared(missing))
-    assert (core.status, core.text) == (
-        "error",
-        f"not installed: {missing}; install morphgen again",
-    )
+    assert core.status == "error"
+    assert core.text == f"not installed: {missing}; install morphgen again"
     (other,) = system._group("extra pybullet", ())
     assert (other.status, other.text) == ("absent", "not available for this version of Python")
 
@@ -231,9 +226,8 @@ def test_a_simulator_that_does_not_move_is_an_error(ur5_plane, monkeypatch):
         simulation.step = lambda targets: None
         return simulation
 
-    monkeypatch.setitem(
-        SIMULATORS._loaded, "kinematic", SimpleNamespace(load=load, devices=("cpu",))
-    )
+    still = SimpleNamespace(load=load, devices=("cpu",))
+    monkeypatch.setitem(SIMULATORS._loaded, "kinematic", still)
     entry = self_test._simulator("it", "kinematic", ur5_plane)
     assert (entry.status, entry.data) == ("error", {"moved": 0.0})
 
@@ -242,10 +236,8 @@ def test_without_drawing_there_are_warnings_only(monkeypatch):
     monkeypatch.setattr(self_test, "render", lambda *_, **__: broken())
     monkeypatch.setattr(self_test, "gl_context", lambda *_: broken())
     entries = by_name(self_test.self_test())
-    assert {name for name, entry in entries.items() if entry.status == "warning"} == {
-        "picture",
-        "film",
-    }
+    warnings = {name for name, entry in entries.items() if entry.status == "warning"}
+    assert warnings == {"picture", "film"}
     assert "libGL.so.1" in entries["film"].text
 
 

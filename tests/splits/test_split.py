@@ -71,10 +71,8 @@ def test_nonphysical_properties_do_not_change_the_hash(changed):
 
 def test_labels_do_not_change_the_hash():
     """The same parts under other symbols are the same robot, or it would leak into train."""
-    links, joints = (
-        {each.name: f"x_{each.name}" for each in each_kind}
-        for each_kind in (arm().links, arm().joints)
-    )
+    links = {link.name: f"x_{link.name}" for link in arm().links}
+    joints = {joint.name: f"x_{joint.name}" for joint in arm().joints}
     renamed = rename(arm(), links, joints)
     assert renamed.joints[0].name.startswith("x_")
     assert robot_hash(renamed) == robot_hash(arm())
