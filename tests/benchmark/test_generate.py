@@ -100,8 +100,7 @@ def test_every_robot_does_every_task():
     request = order(1, 2, tasks=("reach", "push"), obstacles=True)
     splits = interpolation(request, shipped("cubes"), LIBRARY)
     wanted = [f"cubes-00000{i}-{task}" for i in (0, 1) for task in ("reach", "push")]
-    assert names(splits[1].train) == wanted
-    assert names(splits[0].train) == names(splits[1].train)[:2]
+    assert [names(split.train) for split in splits] == [wanted[:2], wanted]
     assert [m.task for m in splits[0].test] == ["reach", "push"]
     assert len({m.robot_hash for m in splits[0].test}) == 1
     assert all(m.obstacles for m in splits[0].train)
@@ -149,9 +148,8 @@ def grammars(*wanted):
 
 
 def test_extrapolation_cycles_through_the_categories():
-    few, many = extrapolation(
-        order(4, 7, test=2), grammars(*CATEGORIES), grammars("chain", "cubes"), LIBRARY
-    )
+    sides = grammars(*CATEGORIES), grammars("chain", "cubes")
+    few, many = extrapolation(order(4, 7, test=2), *sides, LIBRARY)
     assert [m.category for m in many.train] == [*CATEGORIES, *CATEGORIES, "stick"]
     assert names(many.train)[3:] == ["stick-000001", "nlink-000001", "prims-000001", "stick-000002"]
     assert few.train == many.train[:4]
@@ -190,13 +188,9 @@ def cosines(split):
 
 @pytest.mark.parametrize(("bound", "holds"), [("<0.55", np.less), (" > .55 ", np.greater)])
 def test_a_bound_on_similarity_holds_for_every_size(bound, holds):
-    splits = extrapolation(
-        replace(order(3, 9, test=2), max_links=25),
-        grammars(*CATEGORIES),
-        grammars("chain"),
-        LIBRARY,
-        similarity=parse_bound(bound),
-    )
+    wide, limit = replace(order(3, 9, test=2), max_links=25), parse_bound(bound)
+    sides = grammars(*CATEGORIES), grammars("chain")
+    splits = extrapolation(wide, *sides, LIBRARY, similarity=limit)
     for split in splits:
         nearest = cosines(split).max(axis=1)
         assert holds(nearest, 0.55).all()
@@ -204,11 +198,10 @@ def test_a_bound_on_similarity_holds_for_every_size(bound, holds):
 
 
 def test_too_many_links_are_a_finding_unless_max_links_is_raised():
-    wanted = order(2, test=6)
+    wanted, sides = order(2, test=6), (grammars("stick"), grammars("chain"))
     with pytest.raises(BenchmarkError, match=r"robot 'chain-\d+' has 25 links, more than max_li"):
-        extrapolation(wanted, grammars("stick"), grammars("chain"), LIBRARY)
-    wide = replace(wanted, max_links=25)
-    (made,) = extrapolation(wide, grammars("stick"), grammars("chain"), LIBRARY)
+        extrapolation(wanted, *sides, LIBRARY)
+    (made,) = extrapolation(replace(wanted, max_links=25), *sides, LIBRARY)
     assert made.provenance["max_links"] == made.max_links == 25
     assert "links-many" not in {each.code for each in audit(made, LIBRARY).findings}
     narrower = {k: v for k, v in made.provenance.items() if k != "max_links"}

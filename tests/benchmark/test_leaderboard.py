@@ -65,6 +65,13 @@ def this_version(monkeypatch):
     monkeypatch.setattr(results_module, "version", lambda name: VERSION)
 
 
+def stored(folder, **submissions):
+    """Write the data of submissions as JSON; return the paths."""
+    for name, values in submissions.items():
+        (folder / f"{name}.json").write_text(json.dumps(values))
+    return [folder / f"{name}.json" for name in submissions]
+
+
 def test_scores_are_computed_from_the_episodes():
     row = score_submission(submission())
     assert (row.method, row.source, row.seeds, row.episodes) == ("ours", "submission", (0,), 4)
@@ -149,24 +156,21 @@ def test_rows_are_ranked_by_the_test_robots():
 def test_fine_tuned_policies_are_told_from_others(tmp_path, this_version):
     training = {"simulator": "warp", "transitions": 1000}
     tuned = data() | {"training": training | {"finetuned": 30_000}}
-    for name, values in (("zero-shot", data() | {"training": training}), ("tuned", tuned)):
-        (tmp_path / f"{name}.json").write_text(json.dumps(values))
-    paths = [tmp_path / name for name in ("zero-shot.json", "tuned.json")]
+    paths = stored(tmp_path, zero_shot=data() | {"training": training}, tuned=tuned)
     references = collect_references(paths, SPLIT, PROTOCOL, LIBRARY)
-    stored = {f"submissions/ours-{run}.json" for run in ("seed0", "fine-tuned-30000-seed0")}
-    assert set(reference_files(references)) == {"scores.json", *stored}
+    names = {f"submissions/ours-{run}.json" for run in ("seed0", "fine-tuned-30000-seed0")}
+    assert set(reference_files(references)) == {"scores.json", *names}
     assert [each.label for each in references.rows()] == ["ours (fine-tuned 30,000)", "ours"]
     assert "ours (fine-tuned 30,000)" in ranking_table(references.rows())
 
 
 def test_references_are_submissions_and_episodes_of_studies(tmp_path, this_version):
     baseline = data("random") | BASELINE
-    for method, values in (("random", baseline), ("ours", data()), ("other", data("random"))):
-        (tmp_path / f"{method}.json").write_text(json.dumps(values))
+    paths = stored(tmp_path, random=baseline, ours=data(), other=data("random"))
     policy = data("me-mlp") | {"training_seed": 3, "config": {"of": "its study"}}
     (tmp_path / "study").mkdir()
     append_submission(tmp_path / "study" / EPISODES, submission(policy))
-    paths = [tmp_path / name for name in ("random.json", "ours.json", "other.json", "study")]
+    paths.append(tmp_path / "study")
     files = reference_files(collect_references(paths, SPLIT, PROTOCOL, LIBRARY))
     assert set(files) == {
         *("scores.json", "submissions/ours-seed0.json", "submissions/random.json"),
@@ -184,7 +188,7 @@ def test_references_are_submissions_and_episodes_of_studies(tmp_path, this_versi
     assert json.loads(files["scores.json"])["rows"] == ranking_data(rows)
     assert read_references(tmp_path).rows() == []
     baseline["robots"] = baseline["robots"][TEST:]
-    (tmp_path / "random.json").write_text(json.dumps(baseline))
+    stored(tmp_path, random=baseline)
     with pytest.raises(BenchmarkError, match=r"random\.json: random: the train robots are missing"):
         collect_references(paths, SPLIT, PROTOCOL, LIBRARY)
     with pytest.raises(BenchmarkError, match=r"train robot [a-z-]+: the release has no episodes"):
@@ -196,7 +200,7 @@ def test_references_of_other_splits_and_rules_are_refused(tmp_path, this_version
     other = small_split(task="push")
     with pytest.raises(BenchmarkError, match=r"no scores of split mine/small, id "):
         collect_references([tmp_path], other, PROTOCOL, LIBRARY)
-    (tmp_path / "a.json").write_text(json.dumps(data(near=100.0)))
+    stored(tmp_path, a=data(near=100.0))
     with pytest.raises(BenchmarkError, match=r"another submission of ours is there"):
         collect_references([tmp_path], SPLIT, PROTOCOL, LIBRARY)
     strict = EvalProtocol(episodes=5)
@@ -245,9 +249,7 @@ def test_references_that_disagree_about_the_random_policy_need_a_submission_of_i
     forged = data("b")
     forged["robots"][TEST]["random_score"] = [-200.0] * 4
     baseline = data("random") | BASELINE
-    for name, values in (("a", data("a")), ("b", forged), ("random", baseline)):
-        (tmp_path / f"{name}.json").write_text(json.dumps(values))
-    paths = [tmp_path / f"{name}.json" for name in ("a", "b", "random")]
+    paths = stored(tmp_path, a=data("a"), b=forged, random=baseline)
     with pytest.raises(BenchmarkError, match=r"random_score: mean -200\.00; expected -2\.00, as"):
         collect_references(paths[:2], SPLIT, PROTOCOL, LIBRARY)
     references = collect_references(paths, SPLIT, PROTOCOL, LIBRARY)

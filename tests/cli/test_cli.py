@@ -127,9 +127,8 @@ def test_check_prints_code_location_and_fix_of_a_finding(run, robot_urdf):
 
 
 def test_check_fix_writes_a_bundle_without_the_faults(run, urdf, tmp_path):
-    path = urdf(
-        urdf_text(replace(valid_robot(), frames=()), str).replace('xyz="1 0 0"', 'xyz="3 0 0"')
-    )
+    text = urdf_text(replace(valid_robot(), frames=()), str)
+    path = urdf(text.replace('xyz="1 0 0"', 'xyz="3 0 0"'))
     code, out, err = run("check", path, "--fix", "mended")
     assert (code, err) == (0, "written: mended/arm\n")
     assert "repaired axis-not-unit at joint elbow" in out
@@ -164,9 +163,8 @@ def test_a_missing_folder_does_not_stop_other_exports(run):
 
 def test_places_that_cannot_be_written_are_refused_before_the_work(refused, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write anywhere
-    assert "--csv a.csv: folder . cannot be written" in refused(
-        "similarity", "plane", "--csv", "a.csv"
-    )
+    error = refused("similarity", "plane", "--csv", "a.csv")
+    assert "--csv a.csv: folder . cannot be written" in error
     assert "cannot write to out: " in refused("fit", "plane", "--out", "out/made")
 
 
@@ -195,10 +193,8 @@ def test_import_converts_a_urdf_to_a_bundle(ok, robot_urdf, tmp_path):
     out = ok("import", path, "--root-link", "upper", "--tool", "slider", "--out", "robots")
     assert out.startswith("robots/arm: 5 links, 3 DoF, ")
     assert read_bundle(tmp_path / "robots" / "arm").frame("tool").link == "slider"
-    words = ("import", path, "--name", "limb", "--no-picture", "--json")
-    out = ok(*words)
-    assert json.loads(out)["folder"] == "robots/limb"
-    assert json.loads(out)["card"]["source"] == "some_robot.urdf"
+    data = json.loads(ok("import", path, "--name", "limb", "--no-picture", "--json"))
+    assert (data["folder"], data["card"]["source"]) == ("robots/limb", "some_robot.urdf")
 
 
 def test_import_ignores_the_pairs_that_an_srdf_disables(run, refused, robot_urdf, tmp_path):

@@ -27,9 +27,8 @@ HOLD_OUT += ("--from", "arm={lwr,arm3} ee={plane,cube,stick}")
 def test_list_has_one_row_per_split(run, ok):
     out = ok("split", "list")
     header, _, *rows = out.splitlines()
-    assert header.split() == [
-        "name", "regime", "task", "train", "test", "categories", "summary",
-    ]  # fmt: skip
+    columns = ["name", "regime", "task", "train", "test", "categories", "summary"]
+    assert header.split() == columns
     assert [row.split()[0] for row in rows] == split_names()
     row = next(row for row in rows if row.startswith("interpolation/arm3/push-obstacles "))
     assert row.split()[1:9] == [*"interpolation push (obstacles) 10 1 arm3 -> arm3".split()]  # noqa: SIM905
@@ -40,10 +39,9 @@ def test_list_has_one_row_per_split(run, ok):
     assert (facts["train"], facts["test"], facts["regime"]) == (4, 1, "composition")
 
 
-def test_show_prints_one_row_per_robot(run):
-    code, out, err = run("split", "show", "composition/ee-arm/reach")
+def test_show_prints_one_row_per_robot(ok):
+    out = ok("split", "show", "composition/ee-arm/reach")
     split = read_split("composition/ee-arm/reach")
-    assert (code, err) == (0, "")
     assert f"  id: {split_id(split)}\n" in out
     assert "table 1: Composition, EE Arm" in out
     assert "accepted part-unseen: the paper's own" in out
@@ -53,16 +51,14 @@ def test_show_prints_one_row_per_robot(run):
         (row,) = [line for line in out.splitlines() if line.startswith(f"{each.name} ")]
         assert row.split()[1:4] == ["reach", each.category, each.robot_hash[:8]]
     assert "base=fixed(spread=0.6)[top: arm=ur5[flange: ee=plane(size..." in out
-    full = run("split", "show", "composition/ee-arm/reach", "--full")[1]
+    full = ok("split", "show", "composition/ee-arm/reach", "--full")
     assert all(member.derivation in full for member in split.train)
     assert "{robots: 3, grammar: prims, pinned: prim=plane, seed: " in full
 
 
-def test_new_prints_a_summary_and_the_next_command(run, tmp_path):
-    code, out, err = run(*INTERPOLATION, "--seed", 4)
+def test_new_prints_a_summary_and_the_next_command(run, ok, tmp_path):
     name = "interpolation-cubes-reach-seed4"
-    assert (code, err) == (0, "")
-    assert out.splitlines() == [
+    assert ok(*INTERPOLATION, "--seed", 4).splitlines() == [
         f"{name}.yaml: 3 robots of cubes; test: 1 more",
         "  test: cubes-test-000000",
         f"next: morphgen split audit {name}.yaml",
@@ -74,30 +70,27 @@ def test_new_prints_a_summary_and_the_next_command(run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("argv", "name", "counts"),
+    ("argv", "options", "name", "counts"),
     [
-        (INTERPOLATION, "interpolation-cubes-reach-seed0", (3, 1)),
+        (INTERPOLATION, "", "interpolation-cubes-reach-seed0", (3, 1)),
         (
-            (*INTERPOLATION, "--hull", "inside", "--task", "push", "--obstacles"),
-            "interpolation-cubes-inside-push-obstacles-seed0",
-            (3, 1),
+            *(INTERPOLATION, "--hull inside --task push --obstacles"),
+            *("interpolation-cubes-inside-push-obstacles-seed0", (3, 1)),
         ),
-        (COMPOSITION, "composition-ee-reach-seed0", (3, 1)),
-        (HOLD_OUT, "hold-out-ee-plane-reach-seed0", (2, 1)),
+        (COMPOSITION, "", "composition-ee-reach-seed0", (3, 1)),
+        (HOLD_OUT, "", "hold-out-ee-plane-reach-seed0", (2, 1)),
         (
-            (*HOLD_OUT, "--hold-out", "arm3.length=0.3..0.4", "--test", "2", "--task", "push"),
-            "hold-out-ee-plane-arm3.length-0.3..0.4-push-seed0",
-            (2, 2),
+            *(HOLD_OUT, "--hold-out arm3.length=0.3..0.4 --test 2 --task push"),
+            *("hold-out-ee-plane-arm3.length-0.3..0.4-push-seed0", (2, 2)),
         ),
         (
-            (*EXTRAPOLATION, "--similarity", "<0.6", "--test", "2", "--task", "reach,push"),
-            "extrapolation-chain-reach-push-seed0",
-            (12, 4),
+            *(EXTRAPOLATION, "--similarity <0.6 --test 2 --task reach,push"),
+            *("extrapolation-chain-reach-push-seed0", (12, 4)),
         ),
     ],
 )
-def test_every_regime_can_be_created(run, argv, name, counts):
-    data = json.loads(run(*argv, "--json")[1])
+def test_every_regime_can_be_created(run, argv, options, name, counts):
+    data = json.loads(run(*argv, *options.split(), "--json")[1])
     split = read_split(f"{name}.yaml")
     written = {"file": f"{name}.yaml", "name": name, "id": split_id(split), "restricted": []}
     assert data == [written | dict(zip(("train", "test"), counts, strict=True))]
@@ -302,9 +295,7 @@ def test_stats_shows_the_figures_of_the_paper(ok):
 
 def test_stats_merges_splits_with_the_same_robots(run, write):
     path = write(combined(name="mine/some/push"))
-    reach = combined(name="mine/some/reach")
-    sides = [tuple(replace(m, task="reach") for m in side) for side in (reach.train, reach.test)]
-    other = write(replace(reach, train=sides[0], test=sides[1]), "other.yaml")
+    other = write(reaching(name="mine/some/reach"), "other.yaml")
     code, out, _ = run("split", "stats", path, other, "--json")
     (row,) = json.loads(out)["rows"]
     assert code == 0
