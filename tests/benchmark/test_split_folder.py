@@ -503,7 +503,10 @@ def test_meshes_are_verified(tmp_path):
     ("change", "expected"),
     [
         (lambda lines: lines[1].update(mass=1.5), "planar-cube robots.jsonl:2: mass is 1.5, not"),
-        (lambda lines: lines[3].update(side="a"), "planar-plane robots.jsonl:4: side is 'a', not"),
+        (
+            lambda lines: lines[3].update(side="train"),
+            "planar-plane robots.jsonl:4: side is 'train', not 'test'",
+        ),
         (lambda lines: lines[0].pop("task"), "gantry-plane robots.jsonl:1: task is None, not"),
         (lambda lines: lines.pop(), "robots.jsonl it has 3 robots, not 4"),
     ],
