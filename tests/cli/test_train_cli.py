@@ -218,7 +218,7 @@ def test_interrupted_training_can_be_resumed(run, tmp_path, cache):
 
 
 @pytest.mark.slow
-def test_policies_of_a_gpu_are_scored_without_one(run, split_yaml, tmp_path, monkeypatch, refused):
+def test_policies_of_a_gpu_are_scored_without_one(run, split_yaml, tmp_path, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     words = ("study", split_yaml, "--agents", "me-mlp", "--seeds", "0", *SMALL)
     words += ("--steps", "32", "--eval-steps", "300", "--no-tensorboard")
@@ -234,7 +234,9 @@ def test_policies_of_a_gpu_are_scored_without_one(run, split_yaml, tmp_path, mon
     again = read_table(table)
     assert [run.robots for run in again] == [run.robots for run in scores]
     (folder / CHECKPOINT).unlink()
-    assert "device 'cuda': this machine has no CUDA device" in refused(*words, "--device", "cuda")
+    code, _, err = run(*words, "--device", "cuda")
+    assert code == 2
+    assert "device 'cuda': this machine has no CUDA device" in err
 
 
 @pytest.mark.slow

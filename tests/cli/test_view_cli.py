@@ -28,14 +28,13 @@ def address(process):
 def test_a_viewer_serves_until_a_signal_and_deletes_uploads(tmp_path, monkeypatch, end):
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     viewing = start("view", "--port", "8933")
-    port = int(re.search(r":(\d+)", address(viewing))[1])
-    with PlainClient(port) as client:
+    url = address(viewing)
+    assert b"<html" in urllib.request.urlopen(url, timeout=60).read().lower()
+    with PlainClient(int(re.search(r":(\d+)", url)[1])) as client:
         client.upload("a.urdf", b'<robot name="r"><link name="a"/></robot>')
         client.sent_to()
     (folder,) = tmp_path.glob("morphgen-uploads-*")
     assert [path.name for path in folder.rglob("*.urdf")] == ["a.urdf"]
-    page = urllib.request.urlopen(f"http://localhost:{port}", timeout=60)
-    assert b"<html" in page.read().lower()
     viewing.send_signal(end)
     _, errors = viewing.communicate(timeout=60)
     assert (viewing.returncode, errors) == (0, "")

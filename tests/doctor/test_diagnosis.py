@@ -235,6 +235,8 @@ def test_a_simulator_that_does_not_move_is_an_error(ur5_plane, monkeypatch):
 def test_without_drawing_there_are_warnings_only(monkeypatch):
     monkeypatch.setattr(self_test, "render", lambda *_, **__: broken())
     monkeypatch.setattr(self_test, "gl_context", lambda *_: broken())
+    monkeypatch.setattr(self_test, "SIMULATORS", ())  # they and the loaders take seconds
+    monkeypatch.setattr(self_test, "_loaders", lambda *_: ())
     entries = by_name(self_test.self_test())
     warnings = {name for name, entry in entries.items() if entry.status == "warning"}
     assert warnings == {"picture", "film"}
