@@ -31,6 +31,7 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.sampling import sample_robot
+from morphgen.progress import show_progress
 from morphgen.splits.split import SIDES, compose_member
 from morphgen.splits.split_file import split_names
 
@@ -188,6 +189,13 @@ def test_accepting_an_absent_finding_is_a_warning_also_in_plain_data():
     assert data["split"] == "mine/some"
     assert [each["code"] for each in data["findings"]] == ["accepted-unused"]
     assert set(data["nearest"]["planar-plane"]) == set(MEASURES)
+
+
+def test_progress_counts_the_robots_and_their_rows_of_the_matrix():
+    seen = []
+    with show_progress(lambda *now: seen.append(now)):
+        audit(combined(), LIBRARY)
+    assert seen == [(i, 8) for i in range(1, 9)]
 
 
 def test_mimic_joints_and_those_beyond_the_tool_are_movable_but_not_to_the_tool():

@@ -126,6 +126,13 @@ def test_check_prints_code_location_and_fix_of_a_finding(run, robot_urdf):
     assert parts == ("limits-inverted", "joint elbow", "error")
 
 
+def test_check_reports_a_broken_structure_as_findings(run, urdf):
+    path = urdf('<robot name="r"><link name="a"/><link name="b"/></robot>')
+    code, out, err = run("check", path, "--json")
+    assert (code, err) == (1, "")
+    assert [finding["severity"] for finding in json.loads(out)[str(path)]["findings"]] == ["error"]
+
+
 def test_check_fix_writes_a_bundle_without_the_faults(run, urdf, tmp_path):
     text = urdf_text(replace(valid_robot(), frames=()), str)
     path = urdf(text.replace('xyz="1 0 0"', 'xyz="3 0 0"'))

@@ -211,6 +211,18 @@ def test_exports_have_the_same_spheres(ok, balls, tmp_path):
 
 
 @pytest.mark.slow
+def test_curobo_has_eight_spheres_for_a_link_by_default_and_keeps_those_of_a_link(
+    ok, balls, tmp_path
+):
+    words = ("--format", "curobo", "--samples", "50", "--out", tmp_path)
+    ok("export", balls, *words)
+    config = yaml.safe_load((tmp_path / "arm-curobo" / "robot.yml").read_text())
+    spheres = config["robot_cfg"]["kinematics"]["collision_spheres"]
+    assert {link: len(of_link) for link, of_link in spheres.items()} == counts(8)
+    assert spheres["left"] == [{"center": [0.0, 0.0, 0.05], "radius": 0.02}]
+
+
+@pytest.mark.slow
 def test_compose_gives_all_links_spheres(ok, tmp_path):
     ok("compose", "base=planar", "ee=cube", "--geometry", "sphere", "--no-picture", "--out", ".")
     spheres = spheres_of(read_bundle(tmp_path / "planar-cube"))

@@ -164,6 +164,10 @@ def test_derive_prints_one_line_per_part(run, cubes):
     assert text == (cubes / "cubes-000001" / "derivation.txt").read_text().strip()
 
 
+def test_derive_takes_words(run):
+    assert run("derive", "arm=ur5", "ee=plane")[:2] == run("derive", "ur5-plane")[:2]
+
+
 @pytest.mark.parametrize("geometry", ["primitive", "sphere"])
 def test_derive_reproduces_fitted_collision_shapes(run, geometry):
     words = ("--geometry", geometry, "--no-picture")
@@ -212,6 +216,10 @@ def test_mutate_refuses_settings_with_other_conditions(refused, cubes, where, re
     settings = json.loads((cubes / "set.json").read_text())
     (cubes / "set.json").write_text(json.dumps({**settings, "where": where}))
     assert refusal in refused("mutate", cubes / "cubes-000002", "--no-picture")
+
+
+def test_mutate_rejects_robots_missing_from_the_index(refused, cubes):
+    assert "'cubes-000009' is not in the index of" in refused("mutate", cubes / "cubes-000009")
 
 
 def test_compose_follows_a_grammar(run):

@@ -303,6 +303,14 @@ def test_stats_merges_splits_with_the_same_robots(run, write):
     assert (row["ours"]["train"]["robots"], row["paper"]) == (3, None)
 
 
+def test_stats_can_be_markdown(run, write):
+    _, out, _ = run("split", "stats", write(combined()), "--markdown")
+    header, rule, row = out.splitlines()[:3]
+    assert header.startswith("| robots")
+    assert set(rule) <= set("|-:")
+    assert row.startswith("| mine/some")
+
+
 @pytest.mark.slow
 def test_all_scenarios_have_a_row_and_pass_their_audit(run):
     _, out, _ = run("split", "stats", "--json")

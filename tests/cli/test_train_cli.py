@@ -446,6 +446,11 @@ def test_speed_prints_rates_and_shares(sim, ok):
     assert "physics steps per second" in text
 
 
+def test_robots_above_the_default_max_links_can_be_measured(ok):
+    words = ["speed", "reach", "chain", "beads=7", "--envs", "1", "--seconds", "0.05"]
+    assert "reach, chain" in ok(*words, "--sim", "mujoco")
+
+
 @pytest.mark.parametrize("name", POLICIES.builtin)
 def test_shipped_policies_are_small_and_act_on_any_robot(name):
     policy = POLICIES[name]
