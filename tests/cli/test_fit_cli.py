@@ -131,7 +131,6 @@ def test_mesh_fit_as_json_is_in_metres(run, ok, box):
     assert {**again, "seconds": 0} == {**data, "seconds": 0}
 
 
-@pytest.mark.slow
 def test_options_of_a_mesh_fit_are_those_of_the_fit(ok, angle):
     enclosed = json.loads(ok("fit", angle, "--enclose", "--json"))
     assert enclosed["quality"]["coverage"] == 1.0
