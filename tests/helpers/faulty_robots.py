@@ -64,10 +64,6 @@ def hinge(child: str, **changes: object) -> Joint:
     return replace(joint, **changes)
 
 
-def _home(position: float) -> Robot:
-    return replace(valid_robot(), home=(position, *valid_robot().home[1:]))
-
-
 def _weightless_between() -> Robot:
     tip = Link("tip", Inertial(0.1, inertia=(1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4)))
     robot = with_end(Link("cross"), hinge("cross"))
@@ -75,12 +71,6 @@ def _weightless_between() -> Robot:
     return replace(
         robot, links=(*robot.links, tip), joints=(*robot.joints, joint), home=(*robot.home, 0.0)
     )
-
-
-def _colliding() -> Robot:
-    """Return a robot whose lower rod overlaps the base, two joints away."""
-    block = (Shape(Box((2.0, 2.0, 2.0))),)
-    return with_link(valid_robot(), "lower", collisions=block)
 
 
 def _with_pads(n: int) -> Robot:
@@ -120,7 +110,7 @@ ROBOTS: dict[str, Callable[[], Robot]] = {
     "velocity-missing": lambda: with_joint(valid_robot(), "elbow", velocity=None),
     "damping-invalid": lambda: with_joint(valid_robot(), "elbow", damping=-1.0),
     "friction-invalid": lambda: with_joint(valid_robot(), "elbow", friction=math.nan),
-    "home-outside-limits": lambda: _home(3.0),
+    "home-outside-limits": lambda: replace(valid_robot(), home=(3.0, *valid_robot().home[1:])),
     "mimic-on-fixed": lambda: with_end(
         Link("pad"), Joint("pad", "fixed", "slider", "pad", mimic=Mimic("elbow"))
     ),
@@ -140,7 +130,10 @@ ROBOTS: dict[str, Callable[[], Robot]] = {
     "frame-name-taken": lambda: replace(
         valid_robot(), frames=(*valid_robot().frames, Frame("base", "base"))
     ),
-    "self-collision": _colliding,
+    # Its lower rod overlaps the base, two joints away.
+    "self-collision": lambda: with_link(
+        valid_robot(), "lower", collisions=(Shape(Box((2.0, 2.0, 2.0))),)
+    ),
     "tool-missing": lambda: replace(valid_robot(), frames=()),
     "tool-still": lambda: replace(valid_robot(), frames=(Frame("tool", "base"),)),
 }

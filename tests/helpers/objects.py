@@ -32,15 +32,11 @@ def door(pose=HINGED):
 
 def rod():
     """A rod upright on a slide along y."""
-    return Robot(
-        "rod",
-        (
-            Link("base", Inertial(1.0, inertia=SOLID)),
-            Link("tip", Inertial(0.5, inertia=SOLID), collisions=(Shape(Cylinder(0.02, 0.3)),)),
-        ),
-        (Joint("slide", "prismatic", "base", "tip", AT, (0.0, 1.0, 0.0), (-0.5, 0.5), 100.0, 2.0),),
-        home=(-0.2,),
-    )
+    base, shape = Link("base", Inertial(1.0, inertia=SOLID)), Shape(Cylinder(0.02, 0.3))
+    tip = Link("tip", Inertial(0.5, inertia=SOLID), collisions=(shape,))
+    limits = {"limits": (-0.5, 0.5), "effort": 100.0, "velocity": 2.0}
+    slide = Joint("slide", "prismatic", "base", "tip", AT, (0.0, 1.0, 0.0), **limits)
+    return Robot("rod", (base, tip), (slide,), home=(-0.2,))
 
 
 def _object(name, joint, shapes, centre, pose, *frames):

@@ -13,12 +13,7 @@ from morphgen.tasks.observation import tree_entries
 
 N, LINKS, OBSTACLES, POINTS = 4, 6, 3, 8
 COUNT = torch.tensor([6, 4, 1, 3])
-MASKS = {
-    "tokens": "links",
-    "velocity": "links",
-    "previous_action": "links",
-    "lag": "links",
-    "jacobian": "links",
+MASKS = dict.fromkeys(("tokens", "velocity", "previous_action", "lag", "jacobian"), "links") | {
     "goal": "goal_mask",
     "object": "object_mask",
     "line": "object_mask",

@@ -35,26 +35,17 @@ def arm() -> Robot:
         rod("left", 0.1),
         rod("right", 0.1),
     )
-    up = Pose((0.0, 0.0, 0.3))
-    limits = {"limits": (-2.0, 2.0), "effort": 50.0, "velocity": 2.0}
+    low, up = Pose((0.0, 0.0, 0.05)), Pose((0.0, 0.0, 0.3))
+    left, right = Pose((0.0, 0.05, 0.2)), Pose((0.0, -0.05, 0.2))
+    turn = {"limits": (-2.0, 2.0), "effort": 50.0, "velocity": 2.0}
     slide = {"limits": (0.0, 0.04), "effort": 20.0, "velocity": 0.5}
+    follow = {**slide, "limits": (-0.04, 0.0), "mimic": Mimic("left", -1.0, 0.0)}
     joints = (
-        Joint("shoulder", "revolute", "base", "upper", Pose((0.0, 0.0, 0.05)), (0, 1, 0), **limits),
-        Joint("elbow", "revolute", "upper", "lower", up, (1, 0, 0), **limits),
+        Joint("shoulder", "revolute", "base", "upper", low, (0, 1, 0), **turn),
+        Joint("elbow", "revolute", "upper", "lower", up, (1, 0, 0), **turn),
         Joint("extend", "prismatic", "lower", "slider", up, (0, 0, 1), **slide),
-        Joint("left", "prismatic", "slider", "left", Pose((0.0, 0.05, 0.2)), (0, 1, 0), **slide),
-        Joint(
-            "right",
-            "prismatic",
-            "slider",
-            "right",
-            Pose((0.0, -0.05, 0.2)),
-            (0, 1, 0),
-            limits=(-0.04, 0.0),
-            effort=20.0,
-            velocity=0.5,
-            mimic=Mimic("left", -1.0, 0.0),
-        ),
+        Joint("left", "prismatic", "slider", "left", left, (0, 1, 0), **slide),
+        Joint("right", "prismatic", "slider", "right", right, (0, 1, 0), **follow),
     )
     tool = Frame("tool", "slider", Pose.from_xyz_rpy((0.0, 0.0, 0.28), (0.0, 0.3, 0.0)))
     return Robot("arm", links, joints, (tool,), home=(0.4, 0.5, 0.01, 0.02))

@@ -22,9 +22,11 @@ from morphgen.model.kinematics import (
     random_configurations,
 )
 from morphgen.model.robot import Frame, Joint, Link, Robot
+from morphgen.model.tree import rename
 from morphgen.tasks import free_space as of_free_space
 from morphgen.tasks.free_space import SAME, FreeSpace, cspace_components, in_other_component
 from morphgen.tasks.goals import goal_sets
+from morphgen.tasks.goals.goal_sets import set_npz
 from morphgen.tasks.push import starts
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.starts import CLOSE, path_is_clear, push_region
@@ -64,10 +66,6 @@ def scene_of(body, goal_set, ground=LIFTED, layout=0):
     if boxes:
         boxes = place_boxes(boxes, goal_set.layouts[layout])
     return Scene(body, obstacles=boxes, ground=ground)
-
-
-def files(folder):
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 @pytest.mark.parametrize("words", WORDS)
@@ -115,10 +113,8 @@ def test_goals_are_never_inside_an_obstacle(words, folder):
 @pytest.mark.parametrize("ground", [0.0, -0.4])
 @pytest.mark.parametrize("words", WORDS)
 def test_obstacles_are_in_the_workspace_and_clear_of_the_home_pose(words, ground, folder):
-    body = robot(words)
-    goal_set = sample_goals(
-        body, folder, obstacles=True, ground=ground, config=replace(CONFIG, obstacles=6)
-    )
+    body, config = robot(words), replace(CONFIG, obstacles=6)
+    goal_set = sample_goals(body, folder, obstacles=True, ground=ground, config=config)
     reach, centre = workspace(body).reach, shoulder(body)
     q, _ = FreeSpace(Scene(body, ground=ground)).sample(300, np.random.default_rng(9))
     for layout in range(len(goal_set.layouts)):
@@ -163,26 +159,18 @@ def test_cache_key_depends_on_exactly_the_relevant_inputs(body, folder):
     assert len({goals.key for goals in sets}) == len(changes)
     assert not np.isin(first.q, second.q).any()
     assert (first.seed, second.seed) == (0, 1)
-    count = len(files(folder))
+    count = len(list(folder.iterdir()))
     same = replace(CONFIG, near=0.1, max_episode_steps=5, obstacles=7)
     other = replace(body, name="other")
     assert sample_goals(other, folder, config=same).robot == "other"
     assert (sample_goals(other, folder).q == sample_goals(body, folder).q).all()
-    assert len(files(folder)) == count
+    assert len(list(folder.iterdir())) == count
 
 
 def test_stored_set_equals_the_sampled_set(body, folder, monkeypatch):
     fresh = sample_goals(body, folder, obstacles=True)
-
-    def forbidden(*_):
-        raise AssertionError("it was made again")
-
-    monkeypatch.setattr(module, "FreeSpace", forbidden)
-    stored = sample_goals(body, folder, obstacles=True)
-    for name in ("robot", "key", "obstacles", "tried", "accepted", "seed"):
-        assert getattr(stored, name) == getattr(fresh, name)
-    assert (stored.q == fresh.q).all()
-    assert (stored.poses == fresh.poses).all()
+    monkeypatch.setattr(module, "FreeSpace", None)  # it is not made again
+    assert set_npz(sample_goals(body, folder, obstacles=True)) == set_npz(fresh)
 
 
 def test_fixed_tool_is_rejected(body, folder):
@@ -309,16 +297,13 @@ def test_obstacles_that_block_too_much_space_are_redrawn(body, monkeypatch):
 def test_layouts_do_not_depend_on_the_numbers_of_goals_and_layouts(body, folder):
     config = replace(CONFIG, num_goals=30)
     more = replace(config, num_goals=60, train_layouts=5, eval_layouts=4)
-    small, large = (
-        sample_goals(body, folder, obstacles=True, config=one) for one in (config, more)
-    )
+    small, large = (sample_goals(body, folder, obstacles=True, config=c) for c in (config, more))
     assert small.obstacles == large.obstacles
     for side in ("train", "eval"):
-        few, many = layouts_of(config, side), layouts_of(more, side)
-        np.testing.assert_array_equal(
-            small.layouts[few], large.layouts[many][: len(few)], err_msg=side
-        )
-        np.testing.assert_array_equal(small.usable[few], large.usable[many][: len(few), :30])
+        few = layouts_of(config, side)
+        many = layouts_of(more, side)[: len(few)]
+        np.testing.assert_array_equal(small.layouts[few], large.layouts[many], err_msg=side)
+        np.testing.assert_array_equal(small.usable[few], large.usable[many][:, :30])
     assert len(np.unique(large.layouts[:, 0], axis=0)) == 9
     assert (large.layouts == large.layouts.astype(np.float32)).all()
 
@@ -338,17 +323,14 @@ SWEEPS = ("stick", "nlink")
 SHORT = "stick beam.length=0.15"
 
 
-def sample_starts(words, cache, *, config=PUSH, obstacles=False, seed=0, ground=0.0):
-    return draw_goals(
-        robot(words), config, obstacles=obstacles, seed=seed, ground=ground, cache=cache
-    )
+def sample_starts(words, cache, *, config=PUSH, **options):
+    return draw_goals(robot(words), config, ground=0.0, cache=cache, **options)
 
 
 def space_of(words, push_set, layout=None):
     boxes = () if layout is None else place_boxes(push_set.obstacles, push_set.layouts[layout])
-    return FreeSpace(
-        Scene(robot(words), object=push_set.block, obstacles=boxes, ground=push_set.ground)
-    )
+    scene = Scene(robot(words), object=push_set.block, obstacles=boxes, ground=push_set.ground)
+    return FreeSpace(scene)
 
 
 @pytest.mark.parametrize("words", [*ARMS, *FREE, *SWEEPS, SHORT])
@@ -432,17 +414,14 @@ def test_block_positions_and_orientations_are_random(cache):
 
 
 def test_robot_that_cannot_push_is_rejected_with_the_reason(tmp_path, monkeypatch):
-    cache = tmp_path / "pushes"
-    with pytest.raises(
-        TaskError, match=r"'cartpole.*' cannot push: its tool does not move along y"
-    ):
+    cache, behind = tmp_path / "pushes", replace(PUSH, start=-0.9)
+    with pytest.raises(TaskError, match=r"'cartpole.*' cannot push: its tool does not move along"):
         sample_starts("cartpole", cache)
     monkeypatch.setattr(starts, "TRIES", 2)
     with pytest.raises(TaskError, match="'prims' can hardly push: only 0 of 10 poses") as caught:
-        sample_starts("prims", cache, config=replace(PUSH, start=-0.9))
-    assert "acceptance rate 0), 5 are needed; the tool does not get behind it (100%)" in str(
-        caught.value
-    )
+        sample_starts("prims", cache, config=behind)
+    reason = "acceptance rate 0), 5 are needed; the tool does not get behind it (100%)"
+    assert reason in str(caught.value)
     with pytest.raises(TaskError, match="its tool does not get down to the ground"):
         push_region(robot(ARMS[0]), PUSH, -3.0, np.random.default_rng(0))
     with pytest.raises(TaskError, match="its tool is never as low as a block"):
@@ -450,21 +429,15 @@ def test_robot_that_cannot_push_is_rejected_with_the_reason(tmp_path, monkeypatc
     (stored,) = cache.iterdir()
     assert stored.suffix == ".txt"
     monkeypatch.setattr(starts, "draw_feasible", None)  # nothing is tested again
-    other = replace(robot("prims"), name="other")
     with pytest.raises(NoGoalsError) as again:
-        draw_goals(other, replace(PUSH, start=-0.9), ground=0.0, cache=cache)
+        draw_goals(replace(robot("prims"), name="other"), behind, ground=0.0, cache=cache)
     assert str(again.value) == str(caught.value).replace("'prims'", "'other'")
 
 
 def test_obstacles_that_block_every_push_are_an_error(tmp_path, monkeypatch):
-    def wall(*_):
-        return (Block((9.0, 0.1, 0.1)),)
-
-    def across_the_way(*_):
-        return np.array([[0.0, 0.1, 0.05, 1.0, 0.0, 0.0, 0.0]])
-
-    monkeypatch.setattr(obstacles, "draw_boxes", wall)
-    monkeypatch.setattr(obstacles, "_draw_poses", across_the_way)
+    across_the_way = np.array([[0.0, 0.1, 0.05, 1.0, 0.0, 0.0, 0.0]])
+    monkeypatch.setattr(obstacles, "draw_boxes", lambda *_: (Block((9.0, 0.1, 0.1)),))
+    monkeypatch.setattr(obstacles, "_draw_poses", lambda *_: across_the_way)
     with pytest.raises(BenchmarkError, match="of its first 20 goals only 0 or fewer: take"):
         sample_starts("prims", tmp_path, obstacles=True)
 
@@ -509,30 +482,19 @@ def free(scene, *q):
     return FreeSpace(scene).free([[value] for value in q]).tolist()
 
 
-def with_foot():
-    """The robot with a ball below the ground that is fixed to its plate."""
-    foot = Link("foot", collisions=(Shape(Sphere(0.2)),))
-    fixed = Joint("to_foot", "fixed", "plate", "foot", Pose((0.0, 0.5, 0.0)))
-    return replace(aside(), links=(*aside().links, foot), joints=(*aside().joints, fixed))
-
-
-def named_like_surroundings():
-    names = ("world", "ground")
-    links = tuple(replace(a, name=b) for a, b in zip(aside().links, names, strict=True))
-    joint = replace(aside().joints[0], name="to_root", parent="world", child="ground")
-    return Robot("r", links, (joint,), (Frame("tool", "ground"),), (0.0,))
-
-
 def pointing(z):
     """The robot whose tool is above or below its ball."""
     return replace(aside(), frames=(Frame("tool", "ball", Pose((0.0, 0.0, z))),))
 
 
 LOWEST, UNDER_SLAB = -0.5 + 0.1, 1.0 - 0.1 - 0.1 - 0.5
-HIGH_SLAB, THIN = (
-    replace(SLAB, pose=Pose((0.5, 0.0, 1.0))),
-    Block((0.1,) * 3, Pose((0.5, 0.0, 0.9))),
-)
+HIGH_SLAB = replace(SLAB, pose=Pose((0.5, 0.0, 1.0)))
+THIN = Block((0.1,) * 3, Pose((0.5, 0.0, 0.9)))
+# A ball below the ground that is fixed to the plate.
+FOOT = Link("foot", collisions=(Shape(Sphere(0.2)),))
+TO_FOOT = Joint("to_foot", "fixed", "plate", "foot", Pose((0.0, 0.5, 0.0)))
+WITH_FOOT = replace(aside(), links=(*aside().links, FOOT), joints=(*aside().joints, TO_FOOT))
+LIKE_SURROUNDINGS = rename(aside(), {"plate": "world", "ball": "ground"}, {"z": "to_root"})
 
 
 @pytest.mark.parametrize(
@@ -541,7 +503,7 @@ HIGH_SLAB, THIN = (
         (Scene(aside()), {0.0: True, LOWEST - SHALLOW: True, LOWEST - DEEP: False}),
         (Scene(aside(), ground=None), {LOWEST - DEEP: True}),
         (Scene(aside(), Pose((0.0, 0.0, -3.0))), {0.0: False}),
-        (Scene(with_foot()), {0.0: True}),
+        (Scene(WITH_FOOT), {0.0: True}),
         (
             Scene(aside(), obstacles=(HIGH_SLAB,)),
             {UNDER_SLAB + SHALLOW: True, UNDER_SLAB + DEEP: False},
@@ -556,7 +518,7 @@ HIGH_SLAB, THIN = (
         (Scene(aside(), object=replace(SLAB, mass=0.1)), {0.0: True}),
         (Scene(aside(), obstacles=(replace(SLAB, mass=0.1),)), {0.0: False}),
         (
-            Scene(named_like_surroundings(), obstacles=(SLAB,)),
+            Scene(LIKE_SURROUNDINGS, obstacles=(SLAB,)),
             {0.0: False, -0.41: False, 0.9: True},
         ),
     ],
@@ -599,8 +561,7 @@ def test_obstacle_hits_are_named_and_obstacles_may_overlap():
 def test_results_agree_with_mujoco_plane_contacts(scene):
     """The reference model is the exported MJCF in a world with a plane."""
     scene = scene()
-    robot = scene.robot
-    q = random_configurations(robot, 300, np.random.default_rng(1))
+    q = random_configurations(scene.robot, 300, np.random.default_rng(1))
     free_mask = FreeSpace(scene).free(q)
     assert 0.1 < free_mask.mean() < 0.95
     assert free_mask.tolist() == [not hit for hit in plane_hits(scene, q)]
@@ -656,12 +617,9 @@ def test_samples_are_free_uniform_and_a_prefix_of_larger_samples():
 
 def test_robot_without_free_configuration_is_named_with_its_collisions(monkeypatch):
     monkeypatch.setattr(of_free_space, "TRIES", 20)
-    with pytest.raises(BenchmarkError) as caught:
+    message = r"'lift': only 0 of 200 random.*rate 0\).*'ball' and 'ground' collide, in 100%"
+    with pytest.raises(BenchmarkError, match=message):
         FreeSpace(Scene(aside(), Pose((0.0, 0.0, -3.0)))).sample(10, np.random.default_rng(0))
-    text = str(caught.value)
-    assert "'lift': only 0 of 200 random" in text
-    assert "rate 0)" in text
-    assert "'ball' and 'ground' collide, in 100%" in text
 
 
 def block_at(x, z, *, yaw=0.0, pitch=0.0):
@@ -811,30 +769,25 @@ def test_goals_are_in_the_larger_component(tmp_path):
     body = walled(ACROSS)
     both, _ = FreeSpace(Scene(body)).sample(40, np.random.default_rng(0))
     assert 5 < (both[:, 0] > 0.5).sum() < 35
-    goals = draw_goals(body, ReachConfig(num_goals=40), obstacles=False, seed=0, cache=tmp_path)
+    goals, few = (draw_goals(body, ReachConfig(num_goals=n), cache=tmp_path) for n in (40, 7))
     assert (goals.q[:, 0] < 0.5).all()
     assert goals.accepted == 40 < goals.tried
-    few = draw_goals(body, ReachConfig(num_goals=7), obstacles=False, seed=0, cache=tmp_path)
     assert (few.q == goals.q[:7]).all()
     assert REACH.certify(goals, body, Scene(body)) == []
 
 
 def test_too_few_goals_error_counts_the_unreachable_ones():
     space = FreeSpace(Scene(walled(ACROSS)))
-    with pytest.raises(BenchmarkError) as caught:
-        space.sample(1, np.random.default_rng(0), lambda q: False)
-    said = re.search(
-        r"only 0 of 1,000 .* free of collisions and (\d+) more are, but cut", str(caught.value)
-    )
     q = random_configurations(space.scene.robot, 1000, np.random.default_rng(0))
-    assert int(said[1]) == space.free(q).sum() > 100
+    count = space.free(q).sum()
+    assert count > 100
+    message = rf"only 0 of 1,000 .* free of collisions and {count} more are, but cut"
+    with pytest.raises(BenchmarkError, match=message):
+        space.sample(1, np.random.default_rng(0), lambda q: False)
 
 
 def test_certificate_detects_goals_in_another_component(tmp_path):
-    goals = draw_goals(
-        ball(0.2), ReachConfig(num_goals=12), obstacles=False, seed=0, cache=tmp_path
-    )
-    body = walled(ACROSS)
+    goals, body = draw_goals(ball(0.2), ReachConfig(num_goals=12), cache=tmp_path), walled(ACROSS)
     lines = REACH.certify(goals, body, Scene(body))
     there = [i for i, q in enumerate(goals.q) if q[0] > 0.65]
     assert there
