@@ -16,13 +16,8 @@ from morphgen.rl.runs.training import load_networks, resume_learner, state_of
 @pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
 @pytest.mark.parametrize("discrete", [True, False], ids=["discrete", "continuous"])
 def test_a_resumed_run_equals_an_uninterrupted_one(agent, discrete):
-    options = {
-        "agent": agent,
-        "discrete": discrete,
-        "task_reweighting": True,
-        "learning_rate": 3e-3,
-        "desired_kl": 1e-3,
-    }
+    options = {"agent": agent, "discrete": discrete, "task_reweighting": True}
+    options |= {"learning_rate": 3e-3, "desired_kl": 1e-3}
     went_on = learner(**options)
     went_on.iterate(), went_on.iterate()
     checkpoint = stored(state_of(went_on))

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import morphgen
+from helpers.runs import equal
 from morphgen.errors import TaskError
 from morphgen.rl.demonstrations.cloning import recorded_source, returns_of
 from morphgen.rl.demonstrations.dagger import record_states
@@ -23,9 +24,8 @@ def demos(tmp_path_factory):
 
 def test_a_clone_repeats_the_planner(demos, tmp_path):
     run = morphgen.clone(demos.folder, epochs=100, minibatch=128, out=tmp_path / "run")
-    (score,) = morphgen.evaluate(run.folder, robots="prims task=reach", episodes=20).scores[
-        "deterministic"
-    ]
+    result = morphgen.evaluate(run.folder, robots="prims task=reach", episodes=20)
+    (score,) = result.scores["deterministic"]
     assert score.success > 0.5
     lines = (run.folder / "metrics.jsonl").read_text("utf-8").splitlines()
     first, last = (json.loads(line) for line in (lines[0], lines[-1]))
@@ -39,21 +39,15 @@ def test_a_policy_for_several_tasks_sees_the_fields_of_each(demos, tmp_path):
     both = [demos.folder, other.folder]
     run = morphgen.clone(both, epochs=0.2, minibatch=64, out=tmp_path / "run")
     assert "object_base" in str(read_checkpoint(run.folder)[1]["layout"])
-    scores = [
-        morphgen.evaluate(run.folder, robots=f"prims task={task}", episodes=2).scores
-        for task in ("reach", "drawer")
-    ]
-    assert all(len(score["deterministic"]) == 1 for score in scores)
+    for task in ("reach", "drawer"):
+        result = morphgen.evaluate(run.folder, robots=f"prims task={task}", episodes=2)
+        assert len(result.scores["deterministic"]) == 1
 
 
 def test_the_same_seed_gives_the_same_weights(demos, tmp_path):
-    runs = [
-        morphgen.clone(demos.folder, epochs=1, minibatch=64, seed=3, out=tmp_path / name)
-        for name in "ab"
-    ]
-    actors = [read_checkpoint(run.folder)[1]["actor"] for run in runs]
-    assert actors[0].keys() == actors[1].keys()
-    assert all(torch.equal(actors[0][name], actors[1][name]) for name in actors[0])
+    options = {"epochs": 1, "minibatch": 64, "seed": 3}
+    runs = [morphgen.clone(demos.folder, out=tmp_path / name, **options) for name in "ab"]
+    assert equal(*(read_checkpoint(run.folder)[1]["actor"] for run in runs))
 
 
 def test_returns_are_discounted_to_the_end_of_the_episode(demos):
@@ -74,10 +68,8 @@ def test_dagger_labels_the_states_of_the_policy(demos, tmp_path):
     assert not torch.equal(label, executed)
     assert run.config.initial_checkpoint.endswith("round0/checkpoint.pt")
     assert morphgen.verify(states.folder, episodes=1).agrees
-    again = morphgen.clone(
-        demos.folder, dagger="jacobian", out=tmp_path / "run", resume=True, **small
-    )
-    assert again.folder == run.folder
+    small |= {"dagger": "jacobian", "out": tmp_path / "run"}
+    assert morphgen.clone(demos.folder, resume=True, **small).folder == run.folder
 
 
 def test_obstacles_are_those_of_the_goals_of_each_robot(tmp_path):
@@ -95,10 +87,8 @@ def test_training_begins_with_the_networks_of_a_clone(demos, tmp_path):
     steps = {"steps": 256, "envs": 8, "constants": {"num_steps": 32, "minibatches": 2}}
     run = morphgen.train("prims task=reach", initial=clone.folder, out=tmp_path / "run", **steps)
     assert run.config.policy == clone.config.policy
-    count = [
-        int(read_checkpoint(each.folder)[1]["actor"]["normalizer.count"]) for each in (clone, run)
-    ]
-    assert count[1] > count[0] > 0
+    actors = [read_checkpoint(each.folder)[1]["actor"] for each in (clone, run)]
+    assert actors[1]["normalizer.count"] > actors[0]["normalizer.count"] > 0
 
 
 @pytest.mark.parametrize(

@@ -37,12 +37,8 @@ def train_by_two(folder, updates, *options):
     )
     words = (*TRAIN, str(updates * UPDATE), "--out", folder, "--no-tensorboard", *options)
     torchrun = (sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2")
-    done = subprocess.run(
-        [*map(str, (*torchrun, script, folder, *words))],
-        capture_output=True,
-        text=True,
-        timeout=200,
-    )
+    command = [*map(str, (*torchrun, script, folder, *words))]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stderr
     return done.stderr
 

@@ -12,14 +12,7 @@ from helpers.splits import member, split
 from morphgen.errors import TaskError
 from morphgen.progress import show_progress
 from morphgen.rl import evaluation
-from morphgen.rl.evaluation import (
-    EvalConfig,
-    episodes_for,
-    eval_config_of,
-    evaluate_baseline,
-    evaluate_checkpoints,
-    evaluate_run,
-)
+from morphgen.rl.evaluation import EvalConfig, evaluate_baseline, evaluate_checkpoints, evaluate_run
 from morphgen.rl.runs.checkpoint import read_checkpoint, write_checkpoint
 from morphgen.rl.runs.robot_source import other_side, robot_source, split_source
 from morphgen.rl.runs.training import checkpoint_files, subruns_of, train
@@ -71,10 +64,7 @@ def test_the_seed_determines_the_episodes():
 def test_evaluations_are_repeatable_in_both_modes_by_any_workers(run):
     modes = ("deterministic", "deterministic", "stochastic", "stochastic")
     configs = (EVAL, replace(EVAL, workers=2)) * 2
-    found = [
-        evaluate_run(run, "train", config, mode)
-        for config, mode in zip(configs, modes, strict=True)
-    ]
+    found = [evaluate_run(run, "train", *each) for each in zip(configs, modes, strict=True)]
     data = [scores_to_json(scores) for scores in found]
     assert data[0] == data[1] != data[2] == data[3]
     assert found[0][0].random == found[2][0].random
@@ -104,9 +94,8 @@ def test_evaluation_in_several_batches_has_the_same_episodes(run, monkeypatch):
     assert made[:3] == [(0, 4), (4, 4), (8, 2)]
     assert [each.raw for each in parts] == pytest.approx([each.raw for each in whole])
     assert [each.distance for each in parts] == pytest.approx([each.distance for each in whole])
-    assert [each.raw for each in evaluate_baseline("zero", source, config)] == pytest.approx(
-        [each.raw for each in still]
-    )
+    again = evaluate_baseline("zero", source, config)
+    assert [each.raw for each in again] == pytest.approx([each.raw for each in still])
 
 
 def test_push_scores_are_success_rates_and_baselines_reject_other_tasks():
@@ -184,7 +173,7 @@ def test_a_checkpoint_of_another_layout_is_rejected_with_the_difference(run, tmp
         ({"tool_position": True}, "tool True, not False"),
     ],
 )
-def test_policies_with_different_interfaces_are_not_evaluated_together(
+def test_policies_of_different_interfaces_are_not_scored_together(
     run, tmp_path, change, difference
 ):
     config, learner = read_checkpoint(run)
@@ -201,10 +190,8 @@ def test_obstacles_may_surround_only_some_robots(agent, tmp_path):
     def made(words, obstacles):
         return member(words, task="reach", obstacles=obstacles)
 
-    for place, (cube, other, test) in {
-        "one": (False, True, False),
-        "test": (False, False, True),
-    }.items():
+    sides = {"one": (False, True, False), "test": (False, False, True)}
+    for place, (cube, other, test) in sides.items():
         own = made("base=planar ee=cube", cube), made("base=gantry ee=cube", other)
         source = split_source(split(own, (made("base=gantry ee=plane", test),)))
         config, folder = small_config(source, agent=agent, total_timesteps=64), tmp_path / place
@@ -218,7 +205,7 @@ def test_obstacles_may_surround_only_some_robots(agent, tmp_path):
 def test_one_robot_has_no_other_side_and_is_evaluated_with_contacts(tmp_path):
     run_config = replace(small_config(total_timesteps=32), sim="kinematic")
     train(tmp_path, run_config, execution=QUIET)
-    config = eval_config_of(run_config, 35)
+    config = evaluation.eval_config_of(run_config, 35)
     assert config.sim == "mujoco"
     (score,) = evaluate_run(tmp_path, "train", config, "deterministic")
     assert (score.episodes, score.steps) == (36, 36 * 300)  # in rounds: there are 34 environments
@@ -228,21 +215,19 @@ def test_one_robot_has_no_other_side_and_is_evaluated_with_contacts(tmp_path):
 
 def test_eval_config_has_the_simulator_and_tasks_of_the_run(run):
     config, _ = read_checkpoint(run)
-    assert eval_config_of(config, 3) == EvalConfig(3, "mujoco")
-    assert (episodes_for(10_000, 300), episodes_for(1, 300)) == (34, 1)
-    for make, says in (
-        (lambda: EvalConfig(episodes=0), "0 episodes"),
-        (lambda: EvalConfig(seed=2**63), "a seed from 0 to"),
-        (lambda: episodes_for(0, 300), "--steps 0"),
-    ):
-        with pytest.raises(TaskError, match=says):
-            make()
+    assert evaluation.eval_config_of(config, 3) == EvalConfig(3, "mujoco")
+    assert (evaluation.episodes_for(10_000, 300), evaluation.episodes_for(1, 300)) == (34, 1)
+    with pytest.raises(TaskError, match="0 episodes"):
+        EvalConfig(episodes=0)
+    with pytest.raises(TaskError, match="a seed from 0 to"):
+        EvalConfig(seed=2**63)
+    with pytest.raises(TaskError, match="--steps 0"):
+        evaluation.episodes_for(0, 300)
 
 
 def test_score_tables_have_every_robot_and_mode(run, tmp_path):
-    found = {
-        mode: evaluate_run(run, "train", EVAL, mode) for mode in ("deterministic", "stochastic")
-    }
+    modes = ("deterministic", "stochastic")
+    found = {mode: evaluate_run(run, "train", EVAL, mode) for mode in modes}
     lines = Evaluation(found).table().splitlines()
     assert len(lines) == 2 + 4
     assert "MT reach" in Evaluation(found).summary()

@@ -61,10 +61,7 @@ def changed(content, path, value):
 
 
 def nested(levels, wide):
-    value = [1]
-    for _ in range(levels):
-        value = [value] * wide
-    return value
+    return [nested(levels - 1, wide)] * wide if levels else [1]
 
 
 def with_first(number):
@@ -98,11 +95,7 @@ CASES = [
     ("learner/layout/links", 10**12, "layout.links: invalid value 1000000000000; "),
     ("learner/layout/links", -4, "layout.links: invalid value -4; expected"),
     ("learner/layout/channels", 5, "layout.channels: invalid value 5; expected a list"),
-    (
-        MOMENT,
-        torch.ones(2),
-        "parameter 0: exp_avg has shape (2,) of torch.float32; expected (",
-    ),
+    (MOMENT, torch.ones(2), "parameter 0: exp_avg has shape (2,) of torch.float32; expected ("),
     ("learner/optimiser/state/1000000", {}, "state of an unknown parameter 1000000"),
     ("learner/optimiser/state/0", 7, "optimiser.state[0]: invalid value 7; expected keys and"),
     ("learner/batch", nested(12, 10), "more than 1,000,000 values"),
@@ -227,9 +220,8 @@ def test_the_command_line_runs_no_code_of_a_checkpoint(tmp_path, content, capfd,
     torch.save({"more": Bomb(crater)}, tmp_path / "old.pt", _use_new_zipfile_serialization=False)
     (tmp_path / "bare.pt").write_bytes(pickle.dumps(Bomb(crater)))
     for name in ("zip.pt", "old.pt", "bare.pt"):
-        assert refusal(command, tmp_path / name, capfd).startswith(
-            f"morphgen: {tmp_path / name} is not a checkpoint of morphgen train"
-        )
+        says = f"morphgen: {tmp_path / name} is not a checkpoint of morphgen train"
+        assert refusal(command, tmp_path / name, capfd).startswith(says)
     assert not crater.exists()
 
 

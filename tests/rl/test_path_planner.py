@@ -14,31 +14,16 @@ from helpers.resets import reset_envs
 from helpers.scenes import ball, robot
 from helpers.simulators import PYBULLET
 from morphgen.grammar.library import default_library
-from morphgen.model.geometry import Box, Pose, Shape, Sphere
+from morphgen.model.geometry import Box, Pose, Shape
 from morphgen.model.kinematics import joint_limits
 from morphgen.model.kinematics_torch import frame_pose, frame_positions
-from morphgen.model.robot import Frame, Joint, Link, Robot
-from morphgen.rl.baselines import baselines_for, scripted_push
+from morphgen.model.robot import Joint, Link
+from morphgen.rl.baselines import baselines_for, path_planner
+from morphgen.rl.baselines import scripted_push as pushing
 from morphgen.rl.baselines.ik import InverseKinematics
-from morphgen.rl.baselines.path_planner import (
-    PathCost,
-    PathFollower,
-    PathPlanner,
-    fractions_towards,
-)
+from morphgen.rl.baselines.path_planner import PathCost, PathFollower, PathPlanner
 from morphgen.rl.baselines.scripted_articulated import Scripted
-from morphgen.rl.baselines.scripted_push import (
-    MAX_OVERHANG,
-    MAX_PLANS,
-    RISE,
-    SPEED,
-    Push,
-    PushPlanner,
-    ScriptedPush,
-    ToolKinematics,
-    find_contacts,
-    overhang,
-)
+from morphgen.rl.baselines.scripted_push import Push, PushPlanner, ScriptedPush, ToolKinematics
 from morphgen.rl.baselines.simple import GAIN, JacobianColumns, column_steps
 from morphgen.rl.inference import run_episodes
 from morphgen.splits.split_file import read_split
@@ -97,11 +82,8 @@ def test_straight_paths_to_the_nearest_goal_or_by_its_via():
 
 def test_rrt_connect_finds_a_way_out_of_a_pocket():
     """The pocket is open to the other side; of two goals one is in a wall."""
-    walls = (
-        Block((0.1, 1.2, 0.4), Pose((0.5, 0.0, 0.2))),
-        Block((1.0, 0.1, 0.4), Pose((0.0, 0.6, 0.2))),
-        Block((1.0, 0.1, 0.4), Pose((0.0, -0.6, 0.2))),
-    )
+    back = Block((0.1, 1.2, 0.4), Pose((0.5, 0.0, 0.2)))
+    walls = (back, *(Block((1.0, 0.1, 0.4), Pose((0.0, y, 0.2))) for y in (0.6, -0.6)))
     planner, space = planner_of(*walls), space_of(*walls)
     start, goals = np.array([0.2, 0.0]), np.array([[0.5, 0.0], [1.0, 0.0]])
     assert planner.plan_straight(start, goals) is None
@@ -119,14 +101,9 @@ def test_rrt_connect_finds_a_way_out_of_a_pocket():
 
 def test_immovable_joints_keep_their_position():
     """A ball on slides along x and y, and a slide that does not move it."""
-    links = [Link("base"), Link("cart"), Link("ball", collisions=(Shape(Sphere(0.1)),))]
-    joints = (
-        Joint("x", "prismatic", "base", "cart", Pose((0, 0, 0.2)), (1, 0, 0), (-2.0, 2.0)),
-        Joint("y", "prismatic", "cart", "ball", Pose(), (0, 1, 0), (-2.0, 2.0)),
-        Joint("idle", "prismatic", "base", "idle", Pose(), (0, 0, 1), (-1.0, 1.0)),
-    )
-    frames = (Frame("tool", "ball"),)
-    slides = Robot("ball", (*links, Link("idle")), joints, frames, (0.0, 0.0, 0.0))
+    slides, idle = ball(0.2), Joint("idle", "prismatic", "base", "idle", Pose(), (0, 0, 1), (-1, 1))
+    links, joints = (*slides.links, Link("idle")), (*slides.joints, idle)
+    slides = replace(slides, links=links, joints=joints, home=(0.0, 0.0, 0.0))
     wall = Block((0.2, 1.0, 0.4), Pose((0.0, -0.5, 0.2)))
     space = FreeSpace(Scene(slides, obstacles=(wall,)))
     planner = PathPlanner(space, np.full(3, 0.05), 0, np.array([True, True, False]))
@@ -153,10 +130,8 @@ def test_a_tree_stays_on_its_side_of_a_wall():
 
 def test_paths_along_a_tree_lead_to_goals_that_it_can_reach():
     """A wall without a gap hides the cheaper one of two goals, so the path leads to the other."""
-    walls = (
-        Block((0.1, 4.5, 0.4), Pose((0.5, 0.0, 0.2))),
-        Block((0.1, 1.0, 0.4), Pose((-0.3, 0.0, 0.2))),
-    )
+    sizes = ((0.5, 4.5), (-0.3, 1.0))
+    walls = [Block((0.1, width, 0.4), Pose((x, 0.0, 0.2))) for x, width in sizes]
     planner, space = planner_of(*walls), space_of(*walls)
     start, goals = np.array([0.0, 0.0]), np.array([[1.0, 0.0], [-1.0, 0.0]])
     _, tree = planner.plan_rrt(start, NO_GOALS, block=FAR_AWAY, iterations=400)
@@ -198,24 +173,28 @@ def test_the_cheapest_path_is_taken(with_tree, goals, goal_cost, deadline, goal)
     assert planner.plan_straight(start, np.array(goals), **options).goal == goal
 
 
-@pytest.fixture
-def slider_batch(tmp_path):
-    batches = []
+REACH = ReachConfig(num_goals=10)
+CLAW, CHAIN = "arm=arm3 ee=claw", "nlink"
 
-    def make(n, **options):
-        batch = make_batch("reach", [robot("prims")], n, cache=tmp_path, sim="mujoco", **options)
-        batches.append(batch)
-        batch.reset()
-        return batch
+
+@pytest.fixture
+def made(tmp_path):
+    opened = []
+
+    def make(words, n, **options):
+        given = {"cache": tmp_path, "configs": (REACH,), "sim": "mujoco", **options}
+        opened.append(make_batch("reach", [robot(each) for each in words.split(", ")], n, **given))
+        opened[-1].reset()
+        return opened[-1]
 
     yield make
-    for batch in batches:
+    for batch in opened:
         batch.close()
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
-def test_robots_pass_waypoints_that_the_smallest_bin_cannot_reach(slider_batch, kind):
-    batch = slider_batch(1, kind=kind)
+def test_robots_pass_waypoints_that_the_smallest_bin_cannot_reach(made, kind):
+    batch = made("prims", 1, kind=kind)
     follower = PathFollower(batch)
     start = batch.targets[0].numpy().astype(np.float64)
     low, high = joint_limits(batch.specs[0].robot).T
@@ -223,14 +202,14 @@ def test_robots_pass_waypoints_that_the_smallest_bin_cannot_reach(slider_batch, 
     follower.follow(0, [waypoint, goal])
     for _ in range(200):
         finished = follower.advance()
-        batch.step(encode_actions(fractions_towards(batch, follower.waypoint), kind))
+        batch.step(encode_actions(path_planner.fractions_towards(batch, follower.waypoint), kind))
     assert finished.all()
     step = batch.robot_tables.max_step[0]
     assert ((batch.targets[0] - torch.from_numpy(goal)).abs() <= step / 16 + 1e-6).all()
 
 
-def test_followers_take_paths_of_any_length(slider_batch):
-    batch = slider_batch(2)
+def test_followers_take_paths_of_any_length(made):
+    batch = made("prims", 2)
     follower = PathFollower(batch)
     starts = batch.targets.numpy().astype(np.float64)
     other = starts[1] + 0.1
@@ -258,26 +237,7 @@ def test_tested_configurations_are_no_farther_apart_than_the_resolution(
     assert np.abs(np.diff(tested[-1], axis=0)).max() <= resolution + 1e-12
 
 
-REACH = ReachConfig(num_goals=10)
-CLAW, CHAIN = "arm=arm3 ee=claw", "nlink"
-
-
-@pytest.fixture
-def made(tmp_path):
-    opened = []
-
-    def make(words, n, **options):
-        given = {"cache": tmp_path, "configs": (REACH,), "sim": "mujoco", **options}
-        opened.append(make_batch("reach", [robot(each) for each in words.split(", ")], n, **given))
-        opened[-1].reset()
-        return opened[-1]
-
-    yield make
-    for batch in opened:
-        batch.close()
-
-
-def test_joints_of_two_turns_take_the_shorter_way(made):
+def test_joints_of_two_turns_take_the_shorter_way(made, monkeypatch):
     batch = made("arm=ur5 ee=stick", 12)
     tables, steps, follow = batch.robot_tables, [], PathFollower.follow
     assert (tables.upper[0] - tables.lower[0])[tables.moves_tool[0]].max() > 4 * math.pi - 0.01
@@ -289,38 +249,28 @@ def test_joints_of_two_turns_take_the_shorter_way(made):
             steps.append((change / tables.max_step[0]).abs().max())
         follow(follower, env, waypoints)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(PathFollower, "follow", record)
-        InverseKinematics(0).act(batch)
+    monkeypatch.setattr(PathFollower, "follow", record)
+    InverseKinematics(0).act(batch)
     assert len(steps) > 6
     assert max(steps) <= half_turn + 1e-3
 
 
-@pytest.mark.parametrize("words", [CLAW, CHAIN])
-def test_goals_are_reached_by_robots_whose_links_obstruct_each_other(made, words):
-    batch = made(words, 8)
-    episodes = run_episodes(batch, InverseKinematics(0), 1)
-    assert sum(episode.success for episode in episodes) >= 7
-
-
-@pytest.mark.parametrize("words", [CLAW, "prims"])
-def test_poses_are_reached(made, words):
-    batch = made(words, 8, configs=(replace(REACH, goal="pose"),))
+@pytest.mark.parametrize(
+    ("words", "goal"),
+    [(CLAW, "position"), (CHAIN, "position"), (CLAW, "pose"), ("prims", "pose")],
+)
+def test_goals_are_reached_also_by_robots_whose_links_obstruct_each_other(made, words, goal):
+    batch = made(words, 8, configs=(replace(REACH, goal=goal),))
     episodes = run_episodes(batch, InverseKinematics(0), 1)
     assert sum(episode.success for episode in episodes) >= 7
 
 
 def test_a_reach_episode_scores_the_mean_of_its_steps(made):
-    batch, scores = made("prims", 1), []
+    batch, steps = made("prims", 1), []
     step = batch.step
-
-    def watched(actions):
-        scores.append(step(actions))
-        return scores[-1]
-
-    batch.step = watched
+    batch.step = lambda actions: steps.append(step(actions)) or steps[-1]
     (episode,) = run_episodes(batch, InverseKinematics(0), 1)
-    found = [float(each.score[0]) for each in scores]
+    found = [float(each.score[0]) for each in steps]
     assert episode.steps == len(found) == REACH.max_episode_steps
     assert episode.score == pytest.approx(np.mean(found), rel=1e-4)
     assert episode.score != pytest.approx(found[-1], rel=1e-4)
@@ -332,11 +282,6 @@ def test_a_step_is_the_projection_on_the_column():
     steps = column_steps(J, error)
     expected = torch.tensor([[0.05 / 0.25, -0.2, (0.2 + 0.6) / 8, 0.0]])
     assert torch.allclose(steps, expected)
-    # Without the step of joint j, no other step along column j leaves a smaller error.
-    for j in range(3):
-        left = (error - J[:, :, j] * steps[:, j]).norm()
-        for change in (-1e-3, 1e-3):
-            assert (error - J[:, :, j] * (steps[:, j] + change)).norm() > left
 
 
 def test_a_slide_moves_by_a_share_of_the_error_along_its_axis(made):
@@ -367,12 +312,12 @@ def test_different_robots_reach_in_one_batch(made):
 
 def test_orientations_are_approached_where_goals_are_poses(made):
     """A ball on a gantry turns about two axes: each joint has a column of its own."""
-    pose = replace(REACH, goal="pose")
-    batch = made("prims", 12, configs=(pose,))
-    episodes = run_episodes(batch, JacobianColumns(), 1)
-    by_position = made("prims", 12, configs=(pose,))
-    blind = run_episodes(by_position, PositionOnly(), 1)
-    assert sum(e.success for e in episodes) > sum(e.success for e in blind) + 2
+
+    def successes(controller):
+        batch = made("prims", 12, configs=(replace(REACH, goal="pose"),))
+        return sum(episode.success for episode in run_episodes(batch, controller, 1))
+
+    assert successes(JacobianColumns()) > successes(PositionOnly()) + 2
 
 
 class PositionOnly(JacobianColumns):
@@ -411,7 +356,7 @@ def test_a_plan_has_a_free_path_behind_the_block(tmp_path):
         assert position[1] < block[1] - setting.goals.block.size[1] / 2
         assert position[2] == pytest.approx(plan.height)
         assert plan.rotation.numpy() == pytest.approx(rotation, abs=1e-6)
-    across = (setting.goals.line - block[1]) / SPEED
+    across = (setting.goals.line - block[1]) / pushing.SPEED
     hasty, late = (Push(q, block, steps_left=across + each) for each in (-1, 1))
     plans = planner.plan([hasty, late, Push(q, block)])
     assert [plan is None for plan in plans] == [True, False, False]
@@ -431,9 +376,9 @@ def test_a_plan_avoids_overhang(tmp_path, monkeypatch):
     def said(space, configurations, blocks, edge):
         assert blocks.shape == (len(configurations), 7)
         assert (blocks[:, 1] >= block[1]).all()
-        return MAX_OVERHANG * near(configurations)
+        return pushing.MAX_OVERHANG * near(configurations)
 
-    monkeypatch.setattr(scripted_push, "overhang", said)
+    monkeypatch.setattr(pushing, "overhang", said)
     assert near(first)
     assert not near(planner.plan([Push(q, block)])[0].path[-1])
 
@@ -454,8 +399,9 @@ def test_obstructed_arms_push_below_the_middle(tmp_path):
     space, edge = FreeSpace(setting.scene), setting.goals.block.size[0]
     for q, block in zip(setting.goals.q[3:5], setting.goals.blocks[3:5], strict=True):
         end = planner.plan([Push(q, block)])[0].path[-1]
-        centred = block[None] + find_contacts(space, end[None], block[None], edge).offset[0] * X
-        assert overhang(space, end[None], centred, edge)[0] < 0.05
+        contacts = pushing.find_contacts(space, end[None], block[None], edge)
+        centred = block[None] + contacts.offset[0] * X
+        assert pushing.overhang(space, end[None], centred, edge)[0] < 0.05
 
 
 def test_the_tool_can_turn_around():
@@ -468,28 +414,29 @@ def test_the_tool_can_turn_around():
     assert np.abs(reached[1] - turned).max() < 0.02
 
 
+def space_at_block(pusher):
+    """Free space of a robot beside a block of 0.4 m."""
+    return FreeSpace(Scene(pusher, object=Block((0.4, 0.4, 0.4)), ground=None))
+
+
 def test_contacts_are_found_where_the_robot_touches_the_block():
     blocks = np.array([[0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0]] * 3)
     q = np.array([[0.0, -0.5], [0.1, -0.5], [1.5, -0.5]])
-    spaces = [
-        FreeSpace(Scene(ball(height), object=Block((0.4, 0.4, 0.4)), ground=None))
-        for height in (0.2, 0.35)
-    ]
-    low = find_contacts(spaces[0], q, blocks, 0.4)
+    spaces = [space_at_block(ball(height)) for height in (0.2, 0.35)]
+    low = pushing.find_contacts(spaces[0], q, blocks, 0.4)
     assert low.q.tolist() == q[:2].tolist()
     assert low.gap == pytest.approx(0.2, abs=0.002)
     assert low.offset == pytest.approx([0.0, 0.1], abs=0.05)
     assert low.width == pytest.approx(0.5, abs=0.12)
-    assert overhang(spaces[0], q[:2], blocks[:2], 0.4).max() == 0
-    assert overhang(spaces[1], q[:2], blocks[:2], 0.4).min() == MAX_OVERHANG
+    assert pushing.overhang(spaces[0], q[:2], blocks[:2], 0.4).max() == 0
+    assert pushing.overhang(spaces[1], q[:2], blocks[:2], 0.4).min() == pushing.MAX_OVERHANG
 
 
 def test_the_contact_of_a_plate_is_as_wide_as_the_plate():
     plate = Link("ball", collisions=(Shape(Box((0.8, 0.02, 0.3))),))
-    wide = ball(0.2).with_links([plate])
-    scene = Scene(wide, object=Block((0.4, 0.4, 0.4)), ground=None)
-    block = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
-    found = find_contacts(FreeSpace(scene), np.array([[0.0, -0.5]]), block[None], 0.4)
+    space = space_at_block(ball(0.2).with_links([plate]))
+    block = np.array([[0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0]])
+    found = pushing.find_contacts(space, np.array([[0.0, -0.5]]), block, 0.4)
     assert found.width[0] == 1
 
 
@@ -498,14 +445,13 @@ def test_the_overhang_of_a_brim_is_its_lead(ahead, over):
     """A box that touches the block below its middle, and a brim at its upper edge."""
     foot = Shape(Box((0.2, 0.1, 0.1)))
     brim = Shape(Box((0.2, 0.1, 0.02)), Pose((0.0, ahead, 0.3)))
-    wide = ball(0.1).with_links([Link("ball", collisions=(foot, brim))])
-    scene = Scene(wide, object=Block((0.4, 0.4, 0.4)), ground=None)
+    space = space_at_block(ball(0.1).with_links([Link("ball", collisions=(foot, brim))]))
     q = np.array([[0.0, -0.5]] * 2)
-    blocks = np.array([[0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0], [3.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0]])
-    found = find_contacts(FreeSpace(scene), q, blocks, 0.4)
+    blocks = np.array([[x, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0] for x in (0.0, 3.0)])
+    found = pushing.find_contacts(space, q, blocks, 0.4)
     assert found.row.tolist() == [0]
     assert found.gap[0] == pytest.approx(0.25 - max(ahead, 0), abs=0.002)
-    assert overhang(FreeSpace(scene), q, blocks, 0.4) == pytest.approx([over, 0], abs=0.0035)
+    assert pushing.overhang(space, q, blocks, 0.4) == pytest.approx([over, 0], abs=0.0035)
 
 
 def batch(words, n, cache, task="push", **options):
@@ -513,33 +459,18 @@ def batch(words, n, cache, task="push", **options):
     return make_batch(task, robots, n, cache=cache, configs=(FEW_REACH, PUSH), **options)
 
 
-def successes(task, controller, steps=PUSH.max_episode_steps):
-    """Return which first episodes end with the block across the line, shape (n,), bool."""
-    task.reset()
-    over = torch.zeros(task.num_envs, dtype=torch.bool)
-    across = over.clone()
-    for _ in range(steps):
-        step = task.step(controller.act(task))
-        across |= step.success & ~over
-        over |= step.terminated | step.truncated
-        if over.all():
-            break
-    task.close()
-    return across
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("sim", [PYBULLET, "mujoco"])
 @pytest.mark.parametrize("words", [UR5, PANDA, PLANE])
 def test_four_of_five_blocks_cross_the_line(words, sim, tmp_path):
-    across = successes(batch([words], 20, tmp_path, sim=sim), ScriptedPush(0))
-    assert across.float().mean() >= 0.8
+    with closing(batch([words], 20, tmp_path, sim=sim)) as task:
+        assert sum(each.success for each in run_episodes(task, ScriptedPush(0), 1)) >= 16
 
 
 @pytest.mark.slow
 def test_actions_may_be_discrete(tmp_path):
-    task = batch([PLANE], 3, tmp_path, sim="mujoco", kind="discrete")
-    assert successes(task, ScriptedPush(0)).sum() >= 2
+    with closing(batch([PLANE], 3, tmp_path, sim="mujoco", kind="discrete")) as task:
+        assert sum(each.success for each in run_episodes(task, ScriptedPush(0), 1)) >= 2
 
 
 @pytest.mark.slow
@@ -593,7 +524,7 @@ def test_a_block_that_slips_away_is_replanned(tmp_path, monkeypatch):
         if task.step(controller.act(task)).terminated.any():
             break
     task.close()
-    assert 2 <= len(made) <= MAX_PLANS
+    assert 2 <= len(made) <= pushing.MAX_PLANS
     assert not np.allclose(made[0].block, made[1].block)
     left = [push.steps_left for push in made]
     assert left[0] == PUSH.max_episode_steps
@@ -619,8 +550,8 @@ def test_a_tool_rises_when_its_arm_collides(free, tmp_path, monkeypatch):
             heights.append(float(tools[0, 2]))
         assert not task.step(acting).terminated.any()
     task.close()
-    rise = 0.0 if free else RISE
-    assert np.diff(heights[1:]) == pytest.approx(rise, abs=RISE / 3)
+    rise = 0.0 if free else pushing.RISE
+    assert np.diff(heights[1:]) == pytest.approx(rise, abs=pushing.RISE / 3)
 
 
 OBJECTS = ("drawer", "door", "dial")
@@ -630,14 +561,9 @@ EPISODES = 4  # of a task
 
 def batch_of_objects(cache, sim):
     """Make environments of an arm at the tasks, and begin episodes that no success ends."""
-    made = make_batch(
-        WITH_REACH,
-        [robot("arm3-stick")] * len(WITH_REACH),
-        EPISODES * len(WITH_REACH),
-        sim=sim,
-        configs=[TASKS[task].config_type(num_goals=EPISODES) for task in WITH_REACH],
-        cache=cache,
-    )
+    configs = [TASKS[task].config_type(num_goals=EPISODES) for task in WITH_REACH]
+    n, options = len(WITH_REACH), {"sim": sim, "configs": configs, "cache": cache}
+    made = make_batch(WITH_REACH, [robot("arm3-stick")] * n, EPISODES * n, **options)
     made.reset()
     for name in OBJECTS:
         made.groups[name].formulas.travel.fill_(100.0)

@@ -2,6 +2,7 @@
 
 import math
 import sys
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from types import ModuleType
 
@@ -10,71 +11,22 @@ import torch
 from torch.distributions import Categorical, Independent, Normal
 
 import morphgen
+from helpers import observations
 from helpers.learners import SMALL, stored
 from helpers.line_batch import OnALine
-from helpers.observations import (
-    COUNT,
-    LINKS,
-    OBSTACLES,
-    N,
-    agents,
-    filled,
-    kinds,
-    mask_of,
-    networks,
-    observed,
-    outputs,
-)
+from helpers.observations import LINKS, N, agents, filled, kinds, networks, observed, outputs
 from helpers.runs import QUIET, small_config
 from morphgen.encoding.tokens import POSITION
 from morphgen.errors import TaskError
-from morphgen.rl.agents import (
-    AGENTS,
-    FAST,
-    PAPER,
-    PRESETS,
-    Agent,
-    NetworkConfig,
-    encoder,
-    graph,
-    mlp,
-    network_fields,
-    preset_of,
-    transformer,
-)
-from morphgen.rl.agents.encoder import Entities
-from morphgen.rl.config import (
-    NUMBERS,
-    SWITCHES,
-    PolicyConfig,
-    PPOConfig,
-    configs_of,
-    parse_agent,
-    parse_agents,
-    parse_constants,
-)
+from morphgen.rl import agents as networks_of
+from morphgen.rl import config as constants
+from morphgen.rl import observation_layout as layouts
+from morphgen.rl import policies
+from morphgen.rl.agents import AGENTS, FAST, PAPER, encoder, graph, mlp, preset_of, transformer
+from morphgen.rl.config import PolicyConfig, PPOConfig, parse_agent
 from morphgen.rl.inference import Policy, load_policy
-from morphgen.rl.observation_layout import (
-    INITIAL_LOG_STD,
-    MAX_LOG_STD,
-    MIN_LOG_STD,
-    REST,
-    Layout,
-    MaskedGaussian,
-    MaskedMultiDiscrete,
-    bounded_log_std,
-    layout_of,
-    pad_links,
-    require_layout,
-    truncate_links,
-)
-from morphgen.rl.policies import (
-    MAX_NORMALIZED,
-    RunningNormalizer,
-    entries_unneeded,
-    make_networks,
-    rows_needed,
-)
+from morphgen.rl.observation_layout import MaskedGaussian, MaskedMultiDiscrete, layout_of
+from morphgen.rl.policies import RunningNormalizer, entries_unneeded, make_networks, rows_needed
 from morphgen.rl.ppo import Learner, normalized_advantages
 from morphgen.rl.runs.checkpoint import read_checkpoint, require_learner
 from morphgen.rl.runs.training import resume_learner, state_of, train
@@ -132,23 +84,20 @@ def test_every_observation_entry_changes_the_outputs(agent, name):
     actor, critic = networks(agent, seen)
     other = {**seen, name: observed(1)[name]}
     moved = (critic(seen) != critic(other)) & (actor(seen) != actor(other)).any(dim=2).any(dim=1)
-    there = mask_of(seen, name).reshape(N, -1).any(dim=1)
+    there = observations.mask_of(seen, name).reshape(N, -1).any(dim=1)
     assert moved.equal(there)
 
 
 @kinds
 def test_logit_scale_keeps_initial_logits_and_enlarges_their_changes(discrete):
-    seen, layout = observed(), layout_of(observed())
-    (plain, critic), (larger, other) = (
-        make_networks(
-            PolicyConfig(
-                "me-tf", discrete, tool_position=True, network=transformer.Config(logit_scale=scale)
-            ),
-            layout,
-            0,
-        )
-        for scale in (1.0, 16.0)
-    )
+    seen = observed()
+
+    def scaled(scale):
+        network = transformer.Config(logit_scale=scale)
+        config = PolicyConfig("me-tf", discrete, tool_position=True, network=network)
+        return make_networks(config, layout_of(seen), 0)
+
+    (plain, critic), (larger, other) = scaled(1.0), scaled(16.0)
     before = larger(seen)
     torch.testing.assert_close(before, plain(seen))
     assert other(seen).equal(critic(seen))
@@ -197,13 +146,10 @@ def test_bfloat16_outputs_are_close_and_masked(agent):
 def test_weights_for_other_observations_are_rejected_with_the_difference():
     here = layout_of(observed())
     fewer = {**observed(extras=False), "obstacles": torch.zeros(N, 0, 13)}
-    words = (
-        r"a\.pt is for other .*: obstacles 0, here 3; points 0, here 8; channels \(\), here .*; "
-        "tool False, here True"
-    )
-    with pytest.raises(TaskError, match=words):
-        require_layout(layout_of(fewer), here, "a.pt")
-    require_layout(here, layout_of(observed(5)), "a.pt")
+    words = r"obstacles 0, here 3; points 0, here 8; channels \(\), here .*; tool False, here True"
+    with pytest.raises(TaskError, match=rf"a\.pt is for other .*: {words}"):
+        layouts.require_layout(layout_of(fewer), here, "a.pt")
+    layouts.require_layout(here, layout_of(observed(5)), "a.pt")
 
 
 @pytest.mark.parametrize("shown", [True, False])
@@ -220,55 +166,47 @@ def test_tool_position_must_match_the_environments(shown):
 def test_rows_of_entity_kinds_in_a_checkpoint_keep_their_order(extras):
     """Each row is added to the vectors of one kind, in the order of older checkpoints."""
     seen = observed(extras=extras)
-    found = Entities(layout_of(seen), 8, proprioceptive_only=False)
+    found = encoder.Entities(layout_of(seen), 8, proprioceptive_only=False)
     with torch.no_grad():
         for project in found.project.values():
             project.weight.zero_()
         found.kind.copy_(torch.eye(8)[: len(found.kind)])
     vectors, mask = found(seen)
-    rows = [0] * LINKS + [1, 2, 3] + [4] * OBSTACLES + [5] * extras
+    rows = [0] * LINKS + [1, 2, 3] + [4] * observations.OBSTACLES + [5] * extras
     assert torch.equal(vectors, torch.eye(8)[rows] * mask[..., None])
+
+
+def learned(agent, seen, shown, discrete):
+    """Return what networks for an observation make of another, and the gradients that it gives."""
+    actor, critic = networks(agent, seen, discrete=discrete)
+    found = outputs(actor, critic, shown)
+    (found[1].sum() + found[2].square().sum()).backward()
+    gradients = [each.grad for each in (*actor.parameters(), *critic.parameters())]
+    return [*found, *(each for each in gradients if each is not None and each.any())]
 
 
 @agents
 @kinds
 @pytest.mark.parametrize("garbage", [-3e38, math.nan])
-def test_invalid_numbers_in_the_padding_change_nothing(agent, discrete, garbage):
+def test_invalid_numbers_in_the_padding_change_no_output_and_no_gradient(agent, discrete, garbage):
     seen = observed()
-    pair = networks(agent, seen, discrete=discrete)
-    clean, dirty = outputs(*pair, filled(seen, 0.0)), outputs(*pair, filled(seen, garbage))
+    clean, dirty = (learned(agent, seen, filled(seen, fill), discrete) for fill in (0.0, garbage))
     for one, other in zip(clean, dirty, strict=True):
         assert one.isfinite().all()
         assert one.equal(other)
-
-
-@agents
-@kinds
-def test_invalid_numbers_in_the_padding_change_no_gradient(agent, discrete):
-    seen = observed()
-
-    def gradients(fill):
-        actor, critic = networks(agent, seen, discrete=discrete)
-        _, log_prob, value = outputs(actor, critic, filled(seen, fill))
-        (log_prob.sum() + value.square().sum()).backward()
-        return [each.grad for each in (*actor.parameters(), *critic.parameters())]
-
-    for clean, dirty in zip(gradients(0.0), gradients(math.nan), strict=True):
-        assert clean.isfinite().all()
-        assert clean.equal(dirty)
 
 
 @kinds
 def test_the_transformer_acts_and_learns_the_same_without_unused_rows(discrete):
     seen = {name: each[1:] for name, each in observed().items()}
     rows = rows_needed(PolicyConfig("me-tf"), seen)
-    assert rows == COUNT[1:].max() == LINKS - 2
+    assert rows == observations.COUNT[1:].max() == LINKS - 2
     assert rows_needed(PolicyConfig("me-mlp"), seen) == LINKS  # an MLP takes all of its layout
     found = []
-    for needed in (seen, truncate_links(seen, rows)):
+    for needed in (seen, layouts.truncate_links(seen, rows)):
         actor, critic = networks("me-tf", seen, discrete=discrete)
         head = actor.distribution(needed)
-        actions = pad_links(head.mode(), LINKS)
+        actions = layouts.pad_links(head.mode(), LINKS)
         probable = head.log_prob(actions[:, : needed["links"].shape[1]])
         value = critic(needed)
         (probable + head.entropy() + value).sum().backward()
@@ -288,15 +226,7 @@ def test_entries_that_no_task_fills_are_left_out_and_change_nothing(agent, discr
     for policy, tasks in ((agent, {"push", "reach"}), ("me-mlp", {"reach"})):
         assert not entries_unneeded(PolicyConfig(policy), tasks)
     less = {name: value for name, value in seen.items() if name not in unneeded}
-    found = []
-    for needed in (seen, less):
-        actor, critic = networks(agent, seen, discrete=discrete)
-        _, log_prob, value = outputs(actor, critic, needed)
-        (log_prob + value).sum().backward()
-        weights = (*actor.parameters(), *critic.parameters())
-        found.append(
-            [log_prob, value, *(w.grad for w in weights if w.grad is not None and w.grad.any())]
-        )
+    found = [learned(agent, seen, shown, discrete) for shown in (seen, less)]
     for one, other in zip(*found, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
 
@@ -335,9 +265,8 @@ CONFIG = PPOConfig(total_timesteps=64, num_steps=8, epochs=1, minibatches=2)
 @pytest.mark.parametrize("agent", list(AGENTS))
 def test_a_declared_field_reaches_the_networks_and_the_checkpoint(windy, agent):
     learner = Learner(WindyLine(8, tree=agent == "me-graph"), PolicyConfig(agent), CONFIG)
-    assert (
-        learner.layout.fields == learner.layout.as_data()["fields"] == (("wind", 3, "goal_mask"),)
-    )
+    fields = (("wind", 3, "goal_mask"),)
+    assert learner.layout.fields == learner.layout.as_data()["fields"] == fields
     assert "fields" not in layout_of(OnALine(2).observe()).as_data()
     learner.iterate()
     state = state_of(learner)
@@ -370,7 +299,7 @@ def test_a_field_of_another_size_is_rejected(windy):
 
 
 @dataclass(frozen=True)
-class Config(NetworkConfig):
+class Config(networks_of.NetworkConfig):
     width: int = 4
 
 
@@ -395,7 +324,7 @@ def linear(monkeypatch):
     module.Config, module.Network = Config, Network
     monkeypatch.setitem(sys.modules, "linear_agent", module)
     monkeypatch.setattr(AGENTS, "_loaded", dict(AGENTS._loaded))
-    AGENTS.register(Agent("linear", "linear_agent"))
+    AGENTS.register(networks_of.Agent("linear", "linear_agent"))
 
 
 def test_an_agent_of_another_module_trains_and_acts(linear, tmp_path):
@@ -405,8 +334,8 @@ def test_an_agent_of_another_module_trains_and_acts(linear, tmp_path):
     assert stored == config
     assert learner["actor"]["network.enter.weight"].shape[0] == 3
     assert str(parse_agent("linear-symlog")) == "linear-symlog"
-    assert [label for label, _, _ in parse_agents("linear,me-tf")] == ["linear", "me-tf"]
-    assert parse_constants(["width=7"]) == {"width": 7}
+    assert [label for label, _, _ in constants.parse_agents("linear,me-tf")] == ["linear", "me-tf"]
+    assert constants.parse_constants(["width=7"]) == {"width": 7}
 
 
 def test_sizes_of_another_agent_are_refused(linear):
@@ -415,15 +344,10 @@ def test_sizes_of_another_agent_are_refused(linear):
 
 
 def test_a_policy_acts_on_an_observation_alone(tmp_path):
-    from contextlib import closing
-
-    from morphgen.tasks.scenes.make import make_batch
-
     train(tmp_path, small_config(total_timesteps=32), execution=QUIET)
     policy = load_policy(tmp_path)
-    with closing(
-        make_batch("reach", ["planar-cube"], 3, sim="mujoco", **policy.batch_options)
-    ) as batch:
+    options = {"sim": "mujoco", **policy.batch_options}
+    with closing(make_batch("reach", ["planar-cube"], 3, **options)) as batch:
         observation = batch.reset()
         actions = policy.act(observation)
         assert actions.shape == observation["links"].shape
@@ -437,17 +361,15 @@ def test_a_policy_acts_on_an_observation_alone(tmp_path):
 
 @pytest.mark.parametrize("name", POLICIES.builtin)
 def test_a_shipped_policy_is_loaded_by_its_name(name):
-    from contextlib import closing
-
-    from morphgen.tasks.scenes.make import make_batch
-
     policy = load_policy(name)
     (task,) = POLICIES[name].tasks
-    with closing(
-        make_batch(task, ["arm=ur5 ee=stick"], 2, sim="mujoco", **policy.batch_options)
-    ) as batch:
+    options = {"sim": "mujoco", **policy.batch_options}
+    with closing(make_batch(task, ["arm=ur5 ee=stick"], 2, **options)) as batch:
         observation = batch.reset()
         assert policy.act(observation).shape == observation["links"].shape
+
+
+def test_unknown_policies_modes_and_devices_are_refused():
     with pytest.raises(TaskError, match="no such checkpoint"):
         load_policy("zero-shott")
     for mode in ("Deterministic", "greedy", None):
@@ -457,9 +379,8 @@ def test_a_shipped_policy_is_loaded_by_its_name(name):
         load_policy("zero-shot", device="gpu")
 
 
-POLICY = PolicyConfig(
-    "me-graph", discrete=False, observe=("lag", "joint", "jacobian"), normalize=True
-)
+OBSERVE = ("lag", "joint", "jacobian")
+POLICY = PolicyConfig("me-graph", discrete=False, observe=OBSERVE, normalize=True)
 
 
 @pytest.fixture(scope="module")
@@ -477,7 +398,7 @@ def batches(tmp_path_factory):
 
 def test_a_policy_acts_on_a_larger_robot(batches):
     small, large = batches
-    learner = Learner(small, POLICY, PPOConfig(total_timesteps=64, num_steps=8, minibatches=2))
+    learner = Learner(small, POLICY, CONFIG)
     learner.iterate()
     policy = Policy(state_of(learner), "deterministic", 0)
     actions = policy.act(large.reset())
@@ -489,7 +410,7 @@ def test_a_policy_acts_on_a_larger_robot(batches):
 def test_the_order_of_links_does_not_matter(batches):
     """Actions follow the joints when links, and their places in the tree, are listed otherwise."""
     batch = batches[0]
-    learner = Learner(batch, POLICY, PPOConfig(total_timesteps=64, num_steps=8, minibatches=2))
+    learner = Learner(batch, POLICY, CONFIG)
     random = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for weights in learner.actor.parameters():
@@ -511,7 +432,7 @@ def test_the_order_of_links_does_not_matter(batches):
 
 
 def test_the_relations_of_joints_change_actions(batches):
-    learner = Learner(batches[0], POLICY, PPOConfig(total_timesteps=64, num_steps=8, minibatches=2))
+    learner = Learner(batches[0], POLICY, CONFIG)
     observation = learner._network_input(batches[0].reset())
     with torch.no_grad():
         learner.actor.network.head[-1].weight.normal_()
@@ -539,10 +460,7 @@ def test_transitions_are_rounded_up_to_whole_updates():
         (lambda: PPOConfig(learning_rate=math.nan), "learning_rate nan: expected more than 0"),
         (lambda: PPOConfig(gamma=1.5), "gamma 1.5: expected 0 to 1"),
         (lambda: PPOConfig(ent_coef=-1.0), "ent_coef -1: expected 0 or more"),
-        (
-            lambda: PPOConfig(num_steps=10).minibatch_size(3),
-            "10 steps of 3 .* 16 equal minibatches",
-        ),
+        (lambda: PPOConfig(num_steps=10).minibatch_size(3), "10 steps of 3 .* 16 equal minib"),
     ],
 )
 def test_invalid_configurations_are_rejected(make, words):
@@ -550,11 +468,12 @@ def test_invalid_configurations_are_rejected(make, words):
         make()
 
 
-@pytest.mark.parametrize("name", list(PRESETS))
+@pytest.mark.parametrize("name", list(networks_of.PRESETS))
 def test_presets_name_switches_and_constants_that_exist(name):
-    preset = PRESETS[name]
-    assert set(preset.switches) <= set(SWITCHES)
-    assert set(preset.constants) <= {*NUMBERS, *(field for field, _, _ in network_fields())}
+    preset = networks_of.PRESETS[name]
+    assert set(preset.switches) <= set(constants.SWITCHES)
+    fields = {field for field, _, _ in networks_of.network_fields()}
+    assert set(preset.constants) <= {*constants.NUMBERS, *fields}
 
 
 def test_each_agent_has_a_preset():
@@ -567,14 +486,12 @@ def test_each_agent_has_a_preset():
 
 
 def test_the_preset_of_the_paper_changes_nothing():
-    _, ppo = configs_of(parse_agent("me-tf"), ["reach"], PAPER.constants, 1000)
+    _, ppo = constants.configs_of(parse_agent("me-tf"), ["reach"], PAPER.constants, 1000)
     assert asdict(ppo) == asdict(PPOConfig(total_timesteps=1000))
     assert not PAPER.switches
 
 
 def test_advantages_are_normalized_robot_by_robot():
-    import torch
-
     random = torch.Generator().manual_seed(0)
     scale, robots = torch.tensor([1.0, 100.0, 1.0, 100.0]), torch.tensor([0, 1, 0, 1])
     advantages = scale * torch.randn(50, 4, generator=random) + 3
@@ -613,7 +530,7 @@ def torch_discrete(head, row, mask):
 
 @pytest.mark.parametrize(
     ("head", "theirs", "rest"),
-    [(gaussian(), torch_gaussian, 0.0), (discrete(), torch_discrete, REST)],
+    [(gaussian(), torch_gaussian, 0.0), (discrete(), torch_discrete, layouts.REST)],
     ids=["gaussian", "discrete"],
 )
 def test_heads_match_torch_over_the_movable_links(head, theirs, rest):
@@ -625,7 +542,7 @@ def test_heads_match_torch_over_the_movable_links(head, theirs, rest):
         assert head.log_prob(actions)[row] == pytest.approx(other.log_prob(actions[row, mask]))
         assert head.entropy()[row] == pytest.approx(other.entropy())
     assert (head.log_prob(actions)[2], head.entropy()[2]) == (0, 0)  # nothing moves
-    assert BINS[REST] == 0
+    assert BINS[layouts.REST] == 0
     for own in (actions, head.mode()):
         assert set(own[~MASK].tolist()) == {rest}
 
@@ -659,42 +576,32 @@ def test_the_mode_is_the_mean_or_the_bin_nearest_to_it():
 
 def test_log_std_starts_at_its_initial_value_and_stays_in_bounds():
     raw = torch.zeros(1, requires_grad=True)
-    found = bounded_log_std(raw)
-    assert found.item() == pytest.approx(INITIAL_LOG_STD, abs=1e-6)
+    found = layouts.bounded_log_std(raw)
+    assert found.item() == pytest.approx(layouts.INITIAL_LOG_STD, abs=1e-6)
     found.backward()
     assert raw.grad.item() > 0.1
-    far = bounded_log_std(torch.tensor([-20.0, 20.0]))
-    torch.testing.assert_close(far, torch.tensor([MIN_LOG_STD, MAX_LOG_STD]), atol=1e-4, rtol=0)
+    far = layouts.bounded_log_std(torch.tensor([-20.0, 20.0]))
+    torch.testing.assert_close(
+        far, torch.tensor([layouts.MIN_LOG_STD, layouts.MAX_LOG_STD]), atol=1e-4, rtol=0
+    )
 
 
 N_HEADS, HEADS, T, FEATURES = 5, 2, 7, 8
 WAYS = {"as here": transformer.attend, "as on a GPU": transformer.attend_to_few}
 
 
-def some(seed=0):
-    """Return queries, keys, values, and a mask with at least one token per row."""
-    generator = torch.Generator().manual_seed(seed)
-    q, k, v = torch.randn(3, N_HEADS, HEADS, T, FEATURES, generator=generator)
-    mask = torch.rand(N_HEADS, T, generator=generator) < 0.5
-    mask[:, 0] = True
-    return q, k, v, mask
-
-
 @pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 def test_attention_is_a_weighted_mean_of_the_unmasked_values(way):
-    q, k, v, mask = some()
-    found = way(q, k, v, mask)
-    for row in range(N_HEADS):
-        there = torch.nonzero(mask[row])[:, 0].tolist()
-        for head in range(HEADS):
-            for token in range(T):
-                scores = [float(q[row, head, token] @ k[row, head, i]) for i in there]
-                weights = [math.exp(score / math.sqrt(FEATURES)) for score in scores]
-                wanted = torch.tensor(weights) / sum(weights) @ v[row, head, there]
-                torch.testing.assert_close(found[row, head, token], wanted, rtol=1e-4, atol=1e-5)
+    q, k, v = torch.randn(3, N_HEADS, HEADS, T, FEATURES, generator=seeded())
+    mask = torch.rand(N_HEADS, T, generator=seeded(1)) < 0.5
+    mask[:, 0] = True
+    for row, there in enumerate(mask):
+        scores = q[row] @ k[row, :, there].mT / math.sqrt(FEATURES)
+        wanted = scores.softmax(dim=-1) @ v[row, :, there]
+        torch.testing.assert_close(way(q, k, v, mask)[row], wanted, rtol=1e-4, atol=1e-5)
 
 
-LAYOUT = Layout(5, 48, 0, 0, (), vectors=(("lag", 1), ("dls", 3)))
+LAYOUT = layouts.Layout(5, 48, 0, 0, (), vectors=(("lag", 1), ("dls", 3)))
 
 
 def observed_normalizer(seed, rows=7):
@@ -705,10 +612,8 @@ def observed_normalizer(seed, rows=7):
 
 
 def test_statistics_of_parts_are_those_of_the_whole():
-    normalizer, parts = (
-        RunningNormalizer(LAYOUT),
-        [observed_normalizer(seed, 3 + seed) for seed in range(4)],
-    )
+    normalizer = RunningNormalizer(LAYOUT)
+    parts = [observed_normalizer(seed, 3 + seed) for seed in range(4)]
     for part in parts:
         normalizer.update(part)
     values = torch.cat([torch.cat([p["lag"], p["dls"]], dim=-1)[p["links"]] for p in parts])
@@ -726,7 +631,7 @@ def test_columns_are_centred_and_scaled_and_padding_stays_zero():
     torch.testing.assert_close(values.std(), torch.tensor(1.0), atol=0.02, rtol=0)
     assert not normalized["lag"][~seen["links"]].any()
     far = {**seen, "lag": seen["lag"] + 1e6}
-    assert normalizer(far)["lag"].max() == MAX_NORMALIZED
+    assert normalizer(far)["lag"].max() == policies.MAX_NORMALIZED
 
 
 class Lagging(OnALine):

@@ -17,35 +17,14 @@ from helpers.learners import SMALL, equal, learner, weights
 from helpers.line_batch import OnALine
 from helpers.scenes import robot
 from morphgen.errors import TaskError
+from morphgen.rl import ppo
+from morphgen.rl import scores as scoring
 from morphgen.rl.baselines.simple import Zero
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.distributed import ProcessGroup
 from morphgen.rl.inference import make_env_and_controller, play, read_controller, run_episodes
-from morphgen.rl.ppo import (
-    KL_FACTOR,
-    MIN_ACTOR_LR_SCALE,
-    Learner,
-    explained_variance,
-    gae,
-    matching_loss,
-    next_actor_lr_scale,
-    policy_loss,
-    prepared,
-    symexp,
-    symlog,
-)
-from morphgen.rl.scores import (
-    Interval,
-    episode_interval,
-    iqm_interval,
-    mean_error,
-    mean_interval,
-    seeds_success_interval,
-    smallest_mean_difference,
-    smallest_rate_difference,
-    stratified_mean_interval,
-    success_interval,
-)
+from morphgen.rl.ppo import Learner, gae, matching_loss, symexp, symlog
+from morphgen.rl.scores import iqm_interval, stratified_mean_interval, success_interval
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.make import batch_from_specs, make_batch
@@ -55,15 +34,14 @@ from morphgen.tasks.sim import base
 def test_policy_loss_by_hand():
     ratio = torch.tensor([1.5, 1.5, 0.5, 0.5, 1.1])
     advantage = torch.tensor([1.0, -1.0, 1.0, -1.0, 2.0])
-    found = policy_loss(ratio.log(), advantage, 0.2)
+    found = ppo.policy_loss(ratio.log(), advantage, 0.2)
     torch.testing.assert_close(found, torch.tensor([-1.2, 1.5, -0.5, 0.8, -2.2]))
 
 
 def test_the_learning_rate_falls_linearly_over_the_updates():
     trainer = learner()
-    reports = []
-    while not trainer.done:
-        reports.append(trainer.iterate())
+    reports = [trainer.iterate() for _ in range(4)]
+    assert trainer.done
     rates = [each.learning_rate for each in reports]
     assert rates == pytest.approx([3e-4 * share for share in (1, 0.75, 0.5, 0.25)])
     assert [each.transitions for each in reports] == [64, 128, 192, 256]
@@ -76,16 +54,16 @@ def test_the_learning_rate_falls_linearly_over_the_updates():
 @pytest.mark.parametrize(
     ("scale", "kl", "expected"),
     [
-        (1.0, 0.02, 1 / KL_FACTOR),
-        (0.5, 0.02, 0.5 / KL_FACTOR),
-        (0.5, 0.005, 0.5 * KL_FACTOR),
+        (1.0, 0.02, 1 / ppo.KL_FACTOR),
+        (0.5, 0.02, 0.5 / ppo.KL_FACTOR),
+        (0.5, 0.005, 0.5 * ppo.KL_FACTOR),
         (1.0, 0.005, 1.0),
-        (MIN_ACTOR_LR_SCALE, 9.9, MIN_ACTOR_LR_SCALE),
+        (ppo.MIN_ACTOR_LR_SCALE, 9.9, ppo.MIN_ACTOR_LR_SCALE),
     ],
 )
 def test_the_actors_learning_rate_follows_the_kl_divergence(scale, kl, expected):
-    assert next_actor_lr_scale(replace(SMALL, desired_kl=0.01), scale, kl) == expected
-    assert next_actor_lr_scale(SMALL, scale, kl) == 1
+    assert ppo.next_actor_lr_scale(replace(SMALL, desired_kl=0.01), scale, kl) == expected
+    assert ppo.next_actor_lr_scale(SMALL, scale, kl) == 1
 
 
 def test_desired_kl_changes_only_the_actors_learning_rate():
@@ -94,14 +72,14 @@ def test_desired_kl_changes_only_the_actors_learning_rate():
     rate = trainer.iterate().learning_rate
     actor, critic = (group["lr"] for group in trainer.optimiser.param_groups)
     assert critic == pytest.approx(5e-3 * 3 / 4)
-    assert rate == actor == pytest.approx(critic / KL_FACTOR)
+    assert rate == actor == pytest.approx(critic / ppo.KL_FACTOR)
 
 
 @pytest.mark.parametrize(("factor", "explained"), [(1.0, 1), (0.0, 0), (0.5, 0.75), (-1.0, -3)])
 def test_explained_variance_by_hand(factor, explained):
     returns = torch.tensor([[1.0, 2.0], [3.0, 6.0]])
-    assert explained_variance(factor * returns, returns) == pytest.approx(explained)
-    assert explained_variance(returns, torch.ones(2, 2)) == 0
+    assert ppo.explained_variance(factor * returns, returns) == pytest.approx(explained)
+    assert ppo.explained_variance(returns, torch.ones(2, 2)) == 0
 
 
 class Twins(ProcessGroup):
@@ -167,18 +145,18 @@ def test_returns_by_hand(slow, logarithmic):
     trainer = learner(batch, slow_critic=slow, symlog=logarithmic, gae_lambda=0.0, minibatches=4)
     wrong = lambda seen: torch.full_like(seen["line"][:, 0], 99.0)  # noqa: E731
     right = lambda seen: symlog(Answers()(seen)) if logarithmic else Answers()(seen)  # noqa: E731
-    trainer.target_critic.forward, trainer.critic.forward = (
-        (right, wrong) if slow else (wrong, right)
-    )
+    used, other = trainer.target_critic, trainer.critic
+    used.forward, other.forward = (right, wrong) if slow else (wrong, right)
     steps = []
     step = batch.step
     batch.step = lambda actions: steps.append(step(actions)) or steps[-1]
     trainer._collect_rollout()
     values, advantages, returns = trainer._compute_returns()
     after = torch.stack([Answers()(each.final_observation) for each in steps])
-    rewards = torch.stack([each.reward for each in steps])
-    terminated = torch.stack([each.terminated for each in steps])
-    truncated = torch.stack([each.truncated for each in steps])
+    rewards, terminated, truncated = (
+        torch.stack([getattr(each, name) for each in steps])
+        for name in ("reward", "terminated", "truncated")
+    )
     assert terminated.any()
     assert truncated.any()
     torch.testing.assert_close(returns, rewards + 0.99 * after * ~terminated, rtol=1e-4, atol=1e-4)
@@ -187,15 +165,21 @@ def test_returns_by_hand(slow, logarithmic):
     torch.testing.assert_close(advantages, returns - values)
 
 
-def test_each_epoch_has_every_transition_in_one_minibatch():
-    trainer, seen = learner(epochs=3), []
-    loss, other = trainer._run_losses
-    trainer._run_losses = lambda obs, data, w: seen.append((obs, data)) or loss(obs, data, w), other
+def losses_and_data(**options):
+    """Return a learner after an update, its losses of actor and critic, and their arguments."""
+    trainer, seen = learner(**options), []
+    losses = of_actor, of_critic = trainer._run_losses
+    trainer._run_losses = lambda *data: seen.append(data) or of_actor(*data), of_critic
     trainer.iterate()
-    assert [len(data["return"]) for _, data in seen] == [16] * 12
+    return trainer, losses, seen
+
+
+def test_each_epoch_has_every_transition_in_one_minibatch():
+    _, _, seen = losses_and_data(epochs=3)
+    assert [len(data["return"]) for _, data, _ in seen] == [16] * 12
 
     def whole(epoch, name):
-        return torch.cat([data[name] for _, data in seen[4 * epoch : 4 * epoch + 4]])
+        return torch.cat([data[name] for _, data, _ in seen[4 * epoch : 4 * epoch + 4]])
 
     for epoch in range(3):
         advantages = whole(epoch, "advantage")
@@ -205,7 +189,7 @@ def test_each_epoch_has_every_transition_in_one_minibatch():
     first, second = whole(0, "advantage"), whole(1, "advantage")
     assert not first.equal(second)
     assert first.sort().values.equal(second.sort().values)
-    observation, data = seen[0]  # shuffled together
+    observation, data, _ = seen[0]  # shuffled together
     assert observation["object_mask"].equal(data["robot"] == 1)
     head = learner().actor.distribution(observation)
     torch.testing.assert_close(head.log_prob(data["action"]), data["log_prob"])
@@ -253,19 +237,13 @@ def test_robot_weights_are_one_or_random_with_mean_one():
 
 
 def test_a_robot_of_weight_zero_does_not_change_the_loss():
-    trainer, seen = learner(epochs=1, minibatches=1, task_reweighting=True), []
-    of_actor, of_critic = trainer._run_losses
-    trainer._run_losses = (
-        lambda obs, data, w: seen.append((obs, data)) or of_actor(obs, data, w),
-        of_critic,
-    )
-    trainer.iterate()
-    ((obs, data),) = seen
+    _, losses_of, seen = losses_and_data(epochs=1, minibatches=1, task_reweighting=True)
+    ((obs, data, _),) = seen
     changed = {"advantage": 9.0, "return": 9.0}
     other = data | {name: data[name] + by * (data["robot"] == 1) for name, by in changed.items()}
     for robot_weights, same in (([2.0, 0.0], True), ([1.0, 1.0], False)):
         weights = torch.tensor(robot_weights)[data["robot"]]
-        for loss in (of_actor, of_critic):
+        for loss in losses_of:
             losses = [loss(obs, each, weights)[0] for each in (data, other)]
             assert losses[0].equal(losses[1]) == same
 
@@ -360,14 +338,11 @@ CPU = torch.device("cpu")
 
 
 def test_a_failed_compilation_is_a_one_line_error(monkeypatch):
-    def without(function, **options):
-        def call(*args):
-            raise TorchDynamoException("no compiler\nand a long story")
+    def fail(*args):
+        raise TorchDynamoException("no compiler\nand a long story")
 
-        return call
-
-    monkeypatch.setattr(torch, "compile", without)
-    call = prepared(torch.exp, CPU, bf16=False, compiled=True)
+    monkeypatch.setattr(torch, "compile", lambda function, **options: fail)
+    call = ppo.prepared(torch.exp, CPU, bf16=False, compiled=True)
     with pytest.raises(TaskError, match=r"^--compile: torch cannot compile here: no compiler$"):
         call(torch.zeros(1))
 
@@ -386,16 +361,13 @@ def test_compilation_gives_nearly_the_same_update(agent):
 @pytest.mark.parametrize("agent", ["me-mlp", "me-tf"])
 def test_cuda_graphs_of_two_learners_in_turn_learn_the_same(agent):
     for seed in (0, 1):
-        plain, graphs = (
-            learner(agent=agent, seed=seed, device="cuda", compile=compiled)
-            for compiled in (False, True)
-        )
+        options = {"agent": agent, "seed": seed, "device": "cuda"}
+        plain, graphs = learner(**options), learner(**options, compile=True)
         for _ in range(3):
             wanted, found = plain.iterate(), graphs.iterate()
-            assert found.value_loss == pytest.approx(wanted.value_loss, rel=1e-2)
             assert found.actor_gradient == pytest.approx(wanted.actor_gradient, rel=5e-2)
-            assert found.entropy == pytest.approx(wanted.entropy, rel=1e-2)
-            assert found.reward == pytest.approx(wanted.reward, rel=1e-2)
+            for name in ("value_loss", "entropy", "reward"):
+                assert getattr(found, name) == pytest.approx(getattr(wanted, name), rel=1e-2)
 
 
 @pytest.mark.slow
@@ -403,9 +375,8 @@ def test_one_process_compiles_many_learners(monkeypatch):
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="eager"))
     for agent in ("se", "me-mlp", "me-tf"):
         for envs in (2, 4, 6):
-            config = PPOConfig(
-                total_timesteps=envs * 8, num_steps=8, minibatches=2, epochs=1, compile=True
-            )
+            sizes = {"total_timesteps": envs * 8, "num_steps": 8, "minibatches": 2, "epochs": 1}
+            config = PPOConfig(**sizes, compile=True)
             Learner(OnALine(envs), PolicyConfig(agent), config).iterate()
     torch.compiler.reset()
 
@@ -417,13 +388,10 @@ def test_the_first_episodes_are_spread():
 
 
 def test_the_loss_of_a_gpu_has_the_gradients_of_actor_and_critic():
-    trainer, seen = learner(epochs=1, minibatches=1, task_reweighting=True), []
-    of_actor, of_critic = trainer._run_losses
-    trainer._run_losses = lambda *data: seen.append(data) or of_actor(*data), of_critic
-    trainer.iterate()
+    trainer, losses_of, seen = losses_and_data(epochs=1, minibatches=1, task_reweighting=True)
     parameters = [*trainer.actor.parameters(), *trainer.critic.parameters()]
     whole, metrics = trainer._loss(*seen[0])
-    apart = [loss_of(*seen[0]) for loss_of in (of_actor, of_critic)]
+    apart = [loss_of(*seen[0]) for loss_of in losses_of]
     assert metrics.equal(torch.cat([own for _, own in apart]))
     gradients = torch.autograd.grad(whole, parameters)
     others = torch.autograd.grad(apart[0][0], [*trainer.actor.parameters()])
@@ -452,19 +420,14 @@ class Counting(Zero):
         return super().act(task)
 
 
-def test_episodes_run_in_one_thread(two_threads):
-    controller = Counting()
-    run_episodes(make_batch("reach", ["stick"], 1, sim="mujoco"), controller, 1)
-    assert controller.threads == {1}
-
-
-def test_played_episodes_run_in_one_thread(two_threads, tmp_path):
+def test_episodes_run_in_one_thread(two_threads, tmp_path):
+    measured, played = Counting(), Counting()
+    run_episodes(make_batch("reach", ["stick"], 1, sim="mujoco", cache=tmp_path), measured, 1)
     spec = read_controller("zero", "reach")
     env, _ = make_env_and_controller(spec, "stick", 0, sim="mujoco", cache=tmp_path)
-    controller = Counting()
     with closing(env):
-        list(play(env, controller, 1, 0, lambda episode: None))
-    assert controller.threads == {1}
+        list(play(env, played, 1, 0, lambda episode: None))
+    assert measured.threads == played.threads == {1}
 
 
 def test_an_episode_ends_early_after_successes_in_a_row(tmp_path):
@@ -567,11 +530,9 @@ def test_robots_are_strata_of_the_bootstrap():
 
 
 def test_the_wilson_interval_stays_within_0_and_1():
-    for successes, low, high in ((0, 0.0, 0.1611), (10, 0.2993, 0.7007), (20, 0.8389, 1.0)):
-        interval = success_interval(successes / 20, 20)
-        assert interval.value == successes / 20
-        assert interval.low == pytest.approx(low, abs=1e-4)
-        assert interval.high == pytest.approx(high, abs=1e-4)
+    for rate, low, high in ((0, 0.0, 0.1611), (0.5, 0.2993, 0.7007), (1, 0.8389, 1.0)):
+        found = success_interval(rate, 20)
+        assert (found.value, found.low, found.high) == pytest.approx((rate, low, high), abs=1e-4)
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.5, 1.0])
@@ -592,39 +553,40 @@ def test_robots_of_equally_many_episodes_are_as_one():
 def test_seeds_are_the_unit_of_an_interval():
     rng = np.random.default_rng(0)
     seeds = [[rng.normal(mean, 1, 34), rng.normal(mean, 1, 20)] for mean in (0, 0, 10, 10)]
-    found, alone = mean_interval(seeds), mean_interval(seeds[:1])
+    found, alone = scoring.mean_interval(seeds), scoring.mean_interval(seeds[:1])
     assert alone == stratified_mean_interval(seeds[0])
     assert found.value == pytest.approx(np.mean([[np.mean(each) for each in s] for s in seeds]))
     assert found.low < 0.5 < 9.5 < found.high  # of all seeds alike: one in 16 resamples each
-    apart = mean_interval(seeds, together=False)  # two strata are independent samples of seeds
+    # Two strata are independent samples of seeds.
+    apart = scoring.mean_interval(seeds, together=False)
     assert found.high - found.low > apart.high - apart.low > 1
-    assert mean_error(seeds) == pytest.approx(10 / math.sqrt(12), rel=0.1)
-    assert mean_error([[[0.0, 2.0], [1.0, 3.0]]]) == pytest.approx(1 / math.sqrt(2))
+    assert scoring.mean_error(seeds) == pytest.approx(10 / math.sqrt(12), rel=0.1)
+    assert scoring.mean_error([[[0.0, 2.0], [1.0, 3.0]]]) == pytest.approx(1 / math.sqrt(2))
     certain = [[[True] * 20] * 2] * 3
-    assert seeds_success_interval(certain) == success_interval(1, 120)
-    differing = seeds_success_interval([[[True] * 20], [[False] * 20]])
+    assert scoring.seeds_success_interval(certain) == success_interval(1, 120)
+    differing = scoring.seeds_success_interval([[[True] * 20], [[False] * 20]])
     assert (differing.low, differing.high) == (0, 1)
 
 
 @pytest.mark.parametrize("episodes", [34, 340])
 def test_the_smallest_difference_of_rates_follows_from_the_number_of_episodes(episodes):
-    difference = smallest_rate_difference(episodes)
+    difference = scoring.smallest_rate_difference(episodes)
     low, high = (1 - difference) / 2, (1 + difference) / 2
     spread = 1.959964 * math.sqrt(0.5) + 0.841621 * math.sqrt(low * (1 - low) + high * (1 - high))
     assert episodes == pytest.approx((spread / difference) ** 2)  # Fleiss' formula for n
-    assert smallest_rate_difference(1) == 1
-    assert smallest_mean_difference((3.0, 4.0)) == pytest.approx(2.8016 * 5, abs=1e-3)
+    assert scoring.smallest_rate_difference(1) == 1
+    assert scoring.smallest_mean_difference((3.0, 4.0)) == pytest.approx(2.8016 * 5, abs=1e-3)
 
 
 @pytest.mark.parametrize("value", [0, 1])
 def test_scores_that_are_successes_have_the_interval_of_successes(value):
     scores, successes = [[float(value)] * 12] * 3, [[bool(value)] * 12] * 3
-    found = episode_interval([scores], [successes], relative=False)
+    found = scoring.episode_interval([scores], [successes], relative=False)
     assert found == success_interval(value, 36)
-    relative = episode_interval([scores], [successes], relative=True)
+    relative = scoring.episode_interval([scores], [successes], relative=True)
     assert (relative.value, math.isnan(relative.low)) == (value, True)
     mixed = [[0.0, 1.0], [1.0, 1.0]]
-    assert episode_interval([mixed], [mixed], relative=False) == success_interval(0.75, 4)
+    assert scoring.episode_interval([mixed], [mixed], relative=False) == success_interval(0.75, 4)
 
 
 @pytest.mark.parametrize(
@@ -633,10 +595,12 @@ def test_scores_that_are_successes_have_the_interval_of_successes(value):
 def test_scores_without_a_spread_have_no_interval(scores):
     for found in (
         stratified_mean_interval(scores),
-        episode_interval([scores], [[[False] * len(each) for each in scores]], relative=True),
+        scoring.episode_interval(
+            [scores], [[[False] * len(each) for each in scores]], relative=True
+        ),
         iqm_interval(np.transpose(scores), together=True),
         iqm_interval(np.array([[1.0] * 15 + [0.9], [1.0] * 15 + [0.8]]), together=True),
     ):
-        assert isinstance(found, Interval)
+        assert isinstance(found, scoring.Interval)
         assert math.isnan(found.low)
         assert math.isnan(found.high)

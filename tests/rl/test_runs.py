@@ -7,7 +7,6 @@ import sys
 import time
 from contextlib import nullcontext
 from dataclasses import asdict, fields, replace
-from math import isnan
 from types import SimpleNamespace
 
 import pytest
@@ -19,17 +18,8 @@ from helpers.runs import EVAL, PPO, small_config, small_source
 from morphgen.errors import FormatError, MissingDependencyError, TaskError
 from morphgen.rl.distributed import UpdateMetrics
 from morphgen.rl.evaluation import eval_config_of, evaluate_baseline
-from morphgen.rl.runs.checkpoint import (
-    CHECKPOINT,
-    CONFIG,
-    config_from,
-    open_run,
-    packed,
-    read_checkpoint,
-    read_config,
-    unpacked,
-    write_checkpoint,
-)
+from morphgen.rl.runs import checkpoint
+from morphgen.rl.runs.checkpoint import CHECKPOINT, CONFIG, config_from, open_run, read_checkpoint
 from morphgen.rl.runs.robot_source import drawn_source, other_side, robot_source, source_from
 from morphgen.rl.runs.training import METRICS, ROBOTS, read_metrics, recording, state_of
 from morphgen.rl.scores import Evaluation, scores_to_json
@@ -38,29 +28,17 @@ from morphgen.tasks.reach.config import ReachConfig
 
 
 def report(update, success=0.5):
-    numbers = [each.name for each in fields(UpdateMetrics) if each.type == "float"]
-    numbers.remove("success")
-    return UpdateMetrics(
-        update=update,
-        transitions=32 * update,
-        scores=(1.0, math.nan),
-        success=success,
-        episodes=3,
-        unstable=0,
-        terms={"distance": -0.5},
-        **dict.fromkeys(numbers, 0.25),
-    )
+    numbers = {each.name: 0.25 for each in fields(UpdateMetrics) if each.type == "float"}
+    numbers |= {"update": update, "transitions": 32 * update, "episodes": 3, "unstable": 0}
+    terms, scores = {"distance": -0.5}, (1.0, math.nan)
+    return UpdateMetrics(**{**numbers, "success": success}, terms=terms, scores=scores)
 
 
 def test_every_field_of_a_config_is_saved(tmp_path):
-    config = replace(
-        small_config(small_source(), agent="se", gamma=0.9),
-        device="cuda",
-        initial_checkpoint="a.pt",
-        full_budget=True,
-    )
+    other = {"device": "cuda", "initial_checkpoint": "a.pt", "full_budget": True}
+    config = replace(small_config(small_source(), agent="se", gamma=0.9), **other)
     open_run(tmp_path / "run", config, resume=False)
-    assert read_config(tmp_path / "run") == config
+    assert checkpoint.read_config(tmp_path / "run") == config
     stored = json.loads((tmp_path / "run" / CONFIG).read_text())
     assert stored["ppo"]["gamma"] == 0.9
     assert stored["reach"]["near"] == 0.03
@@ -82,7 +60,7 @@ NEWER = replace(
         ({"device": "cpu"}, "another run: device cuda, not cpu"),
         (
             {"seed": 3, "ppo": replace(PPO, gamma=0.5)},
-            r"another run: .*gamma 0\.99, not 0\.5; .*seed 0, not 3",
+            r"run: .*gamma 0\.99, not 0\.5; .*seed 0, not 3",
         ),
         ({"source": small_source(task="push")}, r"another run: source\.split [0-9a-f]{32}, not"),
         ({"source": small_config().source}, r"source\.name mine/small, not planar-cube"),
@@ -91,7 +69,7 @@ NEWER = replace(
 def test_a_run_continues_only_with_resume_and_the_same_config(tmp_path, change, says):
     folder, config = tmp_path / "runs" / "one", replace(small_config(small_source()), device="cuda")
     open_run(folder, config, resume=True)
-    write_checkpoint(folder, config, {"update": 1})
+    checkpoint.write_checkpoint(folder, config, {"update": 1})
     before = tree(tmp_path)
     with pytest.raises(TaskError, match="has a run: pass --resume"):
         open_run(folder, config, resume=False)
@@ -106,8 +84,8 @@ def test_a_run_without_a_checkpoint_may_be_replaced(tmp_path, resume):
     open_run(tmp_path, first, resume=False)
     open_run(tmp_path / ROBOTS / "a", first, resume=False)
     open_run(tmp_path, other, resume=resume)
-    assert read_config(tmp_path) == other
-    write_checkpoint(tmp_path / ROBOTS / "a", first, {"update": 1})
+    assert checkpoint.read_config(tmp_path) == other
+    checkpoint.write_checkpoint(tmp_path / ROBOTS / "a", first, {"update": 1})
     with pytest.raises(TaskError, match="has a run: pass --resume"):
         open_run(tmp_path, first, resume=False)
 
@@ -132,12 +110,12 @@ def test_files_of_others_are_not_changed(tmp_path):
 def test_an_invalid_config_is_rejected(tmp_path, text):
     (tmp_path / CONFIG).write_text(text)
     with pytest.raises(TaskError, match="is not the config of a run"):
-        read_config(tmp_path)
+        checkpoint.read_config(tmp_path)
 
 
 def test_a_checkpoint_stores_the_config_of_its_run(tmp_path):
     config = small_config(robot_source("planar-cube", "push", obstacles=True))
-    write_checkpoint(tmp_path, config, {**state_of(learner()), "update": 3})
+    checkpoint.write_checkpoint(tmp_path, config, {**state_of(learner()), "update": 3})
     for path in (tmp_path, tmp_path / CHECKPOINT):
         run, found = read_checkpoint(path)
         assert run == config
@@ -147,19 +125,19 @@ def test_a_checkpoint_stores_the_config_of_its_run(tmp_path):
 
 def test_other_format_versions_are_rejected(tmp_path):
     open_run(tmp_path, small_config(), resume=False)
-    write_checkpoint(tmp_path, small_config(), {"update": 3})
+    checkpoint.write_checkpoint(tmp_path, small_config(), {"update": 3})
     config = tmp_path / CONFIG
     config.write_text(config.read_text().replace('"format": 3', '"format": 1'))
     with pytest.raises(TaskError, match=r"config.json has format 1; expected 3: it"):
-        read_config(tmp_path)
-    data = unpacked(tmp_path / CHECKPOINT) | {"format": 1}
-    (tmp_path / CHECKPOINT).write_bytes(packed(data, CHECKPOINT))
+        checkpoint.read_config(tmp_path)
+    data = checkpoint.unpacked(tmp_path / CHECKPOINT) | {"format": 1}
+    (tmp_path / CHECKPOINT).write_bytes(checkpoint.packed(data, CHECKPOINT))
     with pytest.raises(TaskError, match=r"checkpoint.pt has format 1"):
         read_checkpoint(tmp_path)
 
 
 def test_files_that_are_not_checkpoints_are_rejected(tmp_path):
-    write_checkpoint(tmp_path, small_config(), {"update": 1})
+    checkpoint.write_checkpoint(tmp_path, small_config(), {"update": 1})
     whole = (tmp_path / CHECKPOINT).read_bytes()
     torch.save({"weights": torch.ones(1)}, tmp_path / "other.pt")
     contents = {"empty.pt": b"", "text.pt": b"hello", "half.pt": whole[: len(whole) // 2]}
@@ -230,9 +208,8 @@ class UsageError(Exception):
 
 def test_wandb_gets_scalars_and_its_error_is_one_line(tmp_path, monkeypatch):
     sent = []
-    run = SimpleNamespace(
-        log=lambda data, step: sent.append((step, data)), finish=lambda: sent.append("finished")
-    )
+    log = lambda data, step: sent.append((step, data))  # noqa: E731
+    run = SimpleNamespace(log=log, finish=lambda: sent.append("finished"))
 
     def init(resume, dir, **options):
         assert resume == "allow"
@@ -311,6 +288,6 @@ def test_scores_of_poses_have_the_angle():
     assert stored["angle"] == score.angle
     assert f"{score.angle * 57.29578:.1f} deg" in Evaluation({"ik": [score]}).table()
     (by_position,) = evaluate_baseline("ik", source, EVAL)
-    assert isnan(by_position.angle)
+    assert math.isnan(by_position.angle)
     assert "deg" not in Evaluation({"ik": [by_position]}).table()
     assert scores_to_json([by_position])[0]["angle"] is None

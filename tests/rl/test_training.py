@@ -12,22 +12,12 @@ import numpy as np
 import pytest
 
 import morphgen
+from helpers import runs
 from helpers.commands import tree
 from helpers.grammars import shipped
 from helpers.learners import learner
 from helpers.line_batch import OnALine
-from helpers.runs import (
-    PPO,
-    QUIET,
-    StoppedError,
-    after,
-    equal,
-    small_config,
-    small_source,
-    stop_after,
-    untimed,
-    weights,
-)
+from helpers.runs import PPO, QUIET, after, small_config, small_source, untimed, weights
 from helpers.splits import member, split
 from morphgen.cli import main
 from morphgen.encoding.robot_hash import robot_hash
@@ -39,42 +29,11 @@ from morphgen.model.robot import TOOL
 from morphgen.progress import show_progress
 from morphgen.rl.agents import mlp
 from morphgen.rl.config import PolicyConfig
-from morphgen.rl.runs import robot_source as drawn_robots
+from morphgen.rl.runs import robot_source as sources
 from morphgen.rl.runs import training
-from morphgen.rl.runs.checkpoint import (
-    CHECKPOINT,
-    read_checkpoint,
-    read_config,
-)
-from morphgen.rl.runs.robot_source import (
-    FILE,
-    draw,
-    drawn_source,
-    num_drawn,
-    other_side,
-    read_drawn,
-    robot_source,
-    specs_of,
-    split_source,
-    tasks_of,
-    trained_on,
-    write_drawn,
-)
-from morphgen.rl.runs.training import (
-    METRICS,
-    ExecutionConfig,
-    TrainingBatches,
-    checkpoint_files,
-    default_slice_updates,
-    num_actuated,
-    num_slices,
-    read_metrics,
-    slice_of,
-    subruns_of,
-    train,
-    updates_between,
-    use_batch,
-)
+from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, read_config
+from morphgen.rl.runs.robot_source import draw, drawn_source, robot_source, specs_of, split_source
+from morphgen.rl.runs.training import ExecutionConfig, TrainingBatches, read_metrics, train
 from morphgen.splits.split import Member, compose_member
 from morphgen.splits.split_file import read_split, split_names, write_split
 from morphgen.tasks.push.config import PushConfig
@@ -84,82 +43,70 @@ from morphgen.tasks.scenes.env_specs import GoalConfig, load_robot
 from morphgen.tasks.scenes.robot_tables import build_robot_tables
 
 
+@pytest.fixture
+def handlers():
+    """Handlers of signals, which are those of before after the test."""
+    before = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+    yield before
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, None])
-def test_a_stopped_run_keeps_its_updates(tmp_path, number):
+def test_a_stopped_run_keeps_its_updates(tmp_path, number, handlers):
     """Signals and the end of the minutes let the running update end and write a checkpoint."""
 
     def interrupt(*_):
         raise KeyboardInterrupt
 
     config, folder = small_config(), tmp_path / "run"
-    before = {each: signal.signal(each, interrupt) for each in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        if number is None:
-            (part,) = train(folder, config, execution=replace(QUIET, minutes=0))
-            assert not training.is_done(part)
-        else:
-            with pytest.raises(KeyboardInterrupt):
-                train(
-                    folder,
-                    config,
-                    execution=QUIET,
-                    show=after(2, partial(signal.raise_signal, number)),
-                )
-        assert {signal.getsignal(each) for each in before} == {interrupt}
-    finally:
-        for each, handler in before.items():
-            signal.signal(each, handler)
+    for each in handlers:
+        signal.signal(each, interrupt)
+    if number is None:
+        (part,) = train(folder, config, execution=replace(QUIET, minutes=0))
+        assert not training.is_done(part)
+    else:
+        show = after(2, partial(signal.raise_signal, number))
+        with pytest.raises(KeyboardInterrupt):
+            train(folder, config, execution=QUIET, show=show)
+    assert {signal.getsignal(each) for each in handlers} == {interrupt}
     assert read_checkpoint(folder)[1]["update"] == (1 if number is None else 3)
     (part,) = train(folder, config, resume=True, execution=QUIET)
     assert training.is_done(part)
     assert [each["update"] for each in read_metrics(folder)] == list(range(1, 7))
 
 
-def test_a_second_signal_acts_at_once(tmp_path):
+def test_a_second_signal_acts_at_once(tmp_path, handlers):
     # A shell starts processes in the background with SIGINT ignored.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def twice():
         signal.raise_signal(signal.SIGINT)
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
-        raise StoppedError
+        raise runs.StoppedError
 
-    try:
-        with pytest.raises(StoppedError):
-            train(tmp_path / "run", small_config(), execution=QUIET, show=after(2, twice))
-    finally:
-        signal.signal(signal.SIGINT, before)
+    with pytest.raises(runs.StoppedError):
+        train(tmp_path / "run", small_config(), execution=QUIET, show=after(2, twice))
 
 
 def test_minutes_count_from_the_first_update(tmp_path, monkeypatch):
     now = [0.0]  # seconds
     monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    draw = training.specs_of
-
-    def slowly(*args):
-        now[0] += 1000
-        return draw(*args)
-
+    slowly = lambda *args: now.__setitem__(0, 1000.0) or specs_of(*args)  # noqa: E731
     monkeypatch.setattr(training, "specs_of", slowly)
-
-    def half_a_minute(part):
-        return lambda report, updates: now.__setitem__(0, now[0] + 30)
-
+    half_a_minute = lambda report, updates: now.__setitem__(0, now[0] + 30)  # noqa: E731
     execution = replace(QUIET, minutes=1)
-    train(tmp_path, small_config(), execution=execution, show=half_a_minute)
+    train(tmp_path, small_config(), execution=execution, show=lambda part: half_a_minute)
     assert len(read_metrics(tmp_path)) == 3
 
 
 def test_a_run_writes_config_checkpoint_and_metrics_and_is_not_trained_again(tmp_path):
     seen, folder, config = [], tmp_path / "a" / "run", small_config()
-
-    def show(part):
-        return lambda report, updates: seen.append((report.update, updates))
-
-    (part,) = train(folder, config, execution=QUIET, show=show)
+    show = lambda report, updates: seen.append((report.update, updates))  # noqa: E731
+    (part,) = train(folder, config, execution=QUIET, show=lambda part: show)
     assert part.folder == folder
-    assert sorted(tree(folder)) == [CHECKPOINT, "config.json", METRICS]
+    assert sorted(tree(folder)) == [CHECKPOINT, "config.json", training.METRICS]
     assert read_config(folder) == config
     assert seen == [(i, 6) for i in range(1, 7)]
     metrics = read_metrics(folder)
@@ -167,7 +114,7 @@ def test_a_run_writes_config_checkpoint_and_metrics_and_is_not_trained_again(tmp
     run, learner = read_checkpoint(folder)
     assert (run, learner["update"]) == (config, 6)
     before = tree(tmp_path)
-    assert train(folder, config, resume=True, execution=QUIET, show=stop_after(1)) == [part]
+    assert train(folder, config, resume=True, execution=QUIET, show=runs.stop_after(1)) == [part]
     with pytest.raises(TaskError, match="pass --resume"):
         train(folder, config, execution=QUIET)
     assert tree(tmp_path) == before
@@ -183,6 +130,29 @@ def test_all_agents_learn_to_push(tmp_path, agent):
     assert {"success", "distance"} <= set(metrics[0]["terms"])
 
 
+def run(folder, config, stop=0):
+    return train(folder, config, resume=True, execution=QUIET, show=runs.stop_after(stop))
+
+
+def assert_resumed_equals_whole(folder, config, *stops):
+    """Compare a run that stops after some updates with one that does not stop."""
+    cut, whole, often = folder / "cut", folder / "whole", training.updates_between(config)
+    for stop in stops:
+        with pytest.raises(runs.StoppedError):
+            run(cut, config, stop)
+        saved = stop // often * often
+        assert (cut / CHECKPOINT).exists() == (saved > 0)
+        assert not saved or read_checkpoint(cut)[1]["update"] == saved
+    seen = []
+    note = lambda report, updates: seen.append(report.update)  # noqa: E731
+    train(cut, config, resume=True, execution=QUIET, show=lambda part: note)
+    assert seen == [*range(saved + 1, config.num_updates + 1)]
+    run(whole, config)
+    assert runs.equal(weights(whole), weights(cut))
+    assert untimed(whole) == untimed(cut)
+    assert len(untimed(whole)) == config.num_updates
+
+
 @pytest.mark.parametrize(
     "stops",
     [(8,), *(pytest.param(stops, marks=pytest.mark.slow) for stops in ((1,), (7, 13)))],
@@ -190,27 +160,7 @@ def test_all_agents_learn_to_push(tmp_path, agent):
 )
 def test_a_resumed_run_ends_with_the_same_weights(tmp_path, stops):
     config = small_config(small_source(), total_timesteps=24 * 4 * 8, slow_critic=True)
-    train(tmp_path / "whole", config, execution=QUIET)
-    assert config.num_updates == 24
-    often = 6  # updates between its checkpoints
-    for stop in stops:
-        with pytest.raises(StoppedError):
-            train(tmp_path / "cut", config, resume=True, execution=QUIET, show=stop_after(stop))
-        saved = stop // often * often
-        assert (tmp_path / "cut" / CHECKPOINT).exists() == (saved > 0)
-        if saved:
-            assert read_checkpoint(tmp_path / "cut")[1]["update"] == saved
-    first = []
-    train(
-        tmp_path / "cut",
-        config,
-        resume=True,
-        execution=QUIET,
-        show=lambda part: lambda report, updates: first.append(report.update),
-    )
-    assert first[0] == stops[-1] // often * often + 1
-    assert equal(weights(tmp_path / "whole"), weights(tmp_path / "cut"))
-    assert untimed(tmp_path / "whole") == untimed(tmp_path / "cut")
+    assert_resumed_equals_whole(tmp_path, config, *stops)
 
 
 @pytest.mark.parametrize(
@@ -226,7 +176,7 @@ def test_a_resumed_run_ends_with_the_same_weights(tmp_path, stops):
 def test_checkpoints_are_five_to_ten_episodes_apart_and_four_at_least(updates, steps, expected):
     config = small_config(total_timesteps=4 * steps * updates, num_steps=steps)
     assert config.num_updates == updates
-    assert updates_between(config) == expected
+    assert training.updates_between(config) == expected
 
 
 def test_no_checkpoint_is_written_right_before_the_last(tmp_path, monkeypatch):
@@ -243,8 +193,12 @@ def test_weights_depend_on_the_seed_and_not_on_the_workers(tmp_path):
     for name, (seed, execution) in ways.items():
         train(tmp_path / name, small_config(seed=seed, total_timesteps=64), execution=execution)
     a, b, c = (weights(tmp_path / name) for name in ways)
-    assert equal(a, b)
-    assert not equal(a, c)
+    assert runs.equal(a, b)
+    assert not runs.equal(a, c)
+
+
+def sizes_of(parts):
+    return [(part.config.num_envs, part.config.ppo.total_timesteps) for part in parts]
 
 
 def test_se_trains_a_policy_per_robot_with_a_share_of_the_budget(tmp_path):
@@ -253,22 +207,19 @@ def test_se_trains_a_policy_per_robot_with_a_share_of_the_budget(tmp_path):
     names = [part.folder.name for part in parts]
     assert [part.config.source.member for part in parts] == names
     assert len(set(names)) == 2
-    assert [(part.config.num_envs, part.config.ppo.total_timesteps) for part in parts] == [
-        (2, 64)
-    ] * 2
+    assert sizes_of(parts) == [(2, 64)] * 2
     assert len({part.config.seed for part in parts} | {config.seed}) == 3
-    assert [file.parent.name for file in checkpoint_files(tmp_path / "run")] == sorted(names)
-    assert not equal(*(weights(part.folder) for part in parts))
+    files = training.checkpoint_files(tmp_path / "run")
+    assert [file.parent.name for file in files] == sorted(names)
+    assert not runs.equal(*(weights(part.folder) for part in parts))
     (parts[0].folder / CHECKPOINT).unlink()
     says = f"1 of its 2 robots have no policy yet, such as {parts[0].folder.name}"
     with pytest.raises(TaskError, match=says):
-        list(checkpoint_files(tmp_path / "run"))
+        list(training.checkpoint_files(tmp_path / "run"))
     for one in (small_config(small_source()), small_config(agent="se")):
-        assert len(subruns_of(tmp_path, one)) == 1
-    whole = subruns_of(tmp_path, replace(config, full_budget=True))
-    assert [(part.config.num_envs, part.config.ppo.total_timesteps) for part in whole] == [
-        (4, 128)
-    ] * 2
+        assert len(training.subruns_of(tmp_path, one)) == 1
+    whole = training.subruns_of(tmp_path, replace(config, full_budget=True))
+    assert sizes_of(whole) == [(4, 128)] * 2
 
 
 def test_a_run_folder_that_is_not_there_is_answered_with_those_beside_it(tmp_path):
@@ -276,7 +227,7 @@ def test_a_run_folder_that_is_not_there_is_answered_with_those_beside_it(tmp_pat
     run.mkdir(parents=True)
     (run / CHECKPOINT).touch()
     with pytest.raises(TaskError, match=rf"did you mean '{re.escape(str(run))}'"):
-        list(checkpoint_files(tmp_path / "runs" / "mine" / "me-graph" / "seed0"))
+        list(training.checkpoint_files(tmp_path / "runs" / "mine" / "me-graph" / "seed0"))
 
 
 def test_a_run_cannot_resume_with_a_changed_robot(tmp_path, monkeypatch):
@@ -297,12 +248,10 @@ def test_a_run_cannot_resume_with_a_changed_robot(tmp_path, monkeypatch):
 
 def test_fine_tuning_starts_from_the_networks_of_a_checkpoint(tmp_path):
     train(tmp_path / "first", small_config(total_timesteps=64), execution=QUIET)
-    config = replace(
-        small_config(total_timesteps=32, learning_rate=1e-30, slow_critic=False),
-        initial_checkpoint=str(tmp_path / "first" / CHECKPOINT),
-    )
+    config = small_config(total_timesteps=32, learning_rate=1e-30, slow_critic=False)
+    config = replace(config, initial_checkpoint=str(tmp_path / "first" / CHECKPOINT))
     train(tmp_path / "second", config, execution=QUIET)
-    assert equal(weights(tmp_path / "first"), weights(tmp_path / "second"))
+    assert runs.equal(weights(tmp_path / "first"), weights(tmp_path / "second"))
     assert read_checkpoint(tmp_path / "second")[1]["update"] == 1
     wider = replace(config, policy=replace(config.policy, network=mlp.Config(4, 16, 1)))
     with pytest.raises(TaskError, match=r"network\.mlp_width 8, here 16$"):
@@ -322,15 +271,16 @@ def test_fine_tuning_starts_from_the_networks_of_a_checkpoint(tmp_path):
         ({"source": small_source(), "num_envs": 1}, "--envs 1: fewer than the 2 robots"),
         ({"ppo": replace(PPO, total_timesteps=31)}, "an update takes 32 transitions"),
         ({"ppo": replace(PPO, minibatches=5)}, "equal minibatches"),
+        (vars(small_config(small_source(), agent="se", total_timesteps=30)), "the share of "),
     ],
 )
 def test_a_run_that_cannot_start_writes_nothing(tmp_path, change, says):
     with pytest.raises(TaskError, match=says):
         train(tmp_path / "run", replace(small_config(), **change), execution=QUIET)
-    short = small_config(small_source(), agent="se", total_timesteps=30)
-    with pytest.raises(TaskError, match="the share of "):
-        train(tmp_path / "run", short, execution=QUIET)
     assert tree(tmp_path) == {}
+
+
+def test_the_number_of_workers_is_at_least_one():
     with pytest.raises(TaskError, match="--workers 0"):
         ExecutionConfig(0)
 
@@ -393,27 +343,23 @@ def drawn_config(request="cubes:4,stick:2", *, updates=24, slice_updates=4, **mo
     return replace(config, tasks=CONFIGS, slice_updates=slice_updates)
 
 
-def run(folder, config, stop=0):
-    return train(folder, config, resume=True, execution=QUIET, show=stop_after(stop))
-
-
 @pytest.mark.parametrize(("robots", "size"), [(6, 4), (5, 5), (7, 2), (1000, 128)])
 def test_slices_use_every_robot_equally_often(robots, size):
-    slices = [slice_of(robots, size, i, seed=3) for i in range(robots)]
+    slices = [training.slice_of(robots, size, i, seed=3) for i in range(robots)]
     assert all(len(each) == size for each in slices)
     assert Counter(np.concatenate(slices).tolist()) == dict.fromkeys(range(robots), size)
     first_pass = np.concatenate(slices)[:robots]
     assert sorted(first_pass) == list(range(robots))
-    assert slices != [slice_of(robots, size, i, seed=4) for i in range(robots)]
+    assert slices != [training.slice_of(robots, size, i, seed=4) for i in range(robots)]
 
 
 def test_a_slice_lasts_two_episodes_or_less_in_a_short_run():
     many = small_config(drawn_source("cubes:9", "reach"), total_timesteps=4 * 8 * 10_000)
-    assert num_slices(many) == 3
-    assert default_slice_updates(many) == 75  # of 8 control steps
-    assert default_slice_updates(replace(many, num_envs=9)) == 0
+    assert training.num_slices(many) == 3
+    assert training.default_slice_updates(many) == 75  # of 8 control steps
+    assert training.default_slice_updates(replace(many, num_envs=9)) == 0
     short = small_config(drawn_source("cubes:9", "reach"), total_timesteps=4 * 8 * 11)
-    assert default_slice_updates(short) == 3
+    assert training.default_slice_updates(short) == 3
 
 
 def test_batches_have_the_robots_of_their_slice():
@@ -430,7 +376,8 @@ def test_batches_have_the_robots_of_their_slice():
     batches.close()
     assert len(seen) == 6
     names = [each.name for each in robots.members]
-    assert seen == [[names[i] for i in slice_of(6, 4, number, config.seed)] for number in range(6)]
+    slices = [training.slice_of(6, 4, number, config.seed) for number in range(6)]
+    assert seen == [[names[i] for i in each] for each in slices]
     assert not batches.changes_at(24)
 
 
@@ -438,7 +385,7 @@ def test_recorded_scores_are_means_of_grammars():
     config = drawn_config()
     batches, grammars = TrainingBatches(config), ["cubes"] * 4 + ["stick"] * 2
     for update in (1, 4, 5):
-        robots = slice_of(6, 4, (update - 1) // 4, config.seed)
+        robots = training.slice_of(6, 4, (update - 1) // 4, config.seed)
         of = {name: [i for i in robots if grammars[i] == name] for name in ("cubes", "stick")}
         means = batches.recorded_scores([float(i) for i in robots], update)
         assert means == pytest.approx([np.mean(of["cubes"]), np.mean(of["stick"])])
@@ -446,16 +393,7 @@ def test_recorded_scores_are_means_of_grammars():
 
 def test_a_resumed_run_of_slices_ends_with_the_same_weights(tmp_path):
     # A checkpoint is written every six updates: at the end of a slice (12) and within one (6, 18).
-    config = drawn_config()
-    for stop in (7, 13, 17):
-        with pytest.raises(StoppedError):
-            run(tmp_path / "cut", config, stop)
-        assert read_checkpoint(tmp_path / "cut")[1]["update"] == stop // 6 * 6
-    run(tmp_path / "cut", config)
-    run(tmp_path / "whole", config)
-    assert equal(weights(tmp_path / "whole"), weights(tmp_path / "cut"))
-    assert untimed(tmp_path / "whole") == untimed(tmp_path / "cut")
-    assert len(untimed(tmp_path / "whole")) == 24
+    assert_resumed_equals_whole(tmp_path, drawn_config(), 7, 13, 17)
     assert {len(each["scores"]) for each in untimed(tmp_path / "whole")} == {2}
 
 
@@ -470,47 +408,39 @@ def test_slices_may_differ_in_their_largest_robot(tmp_path):
     batches.close()
     assert len({len(observation["links"].any(0).nonzero()) for observation in observations}) == 2
     assert {observation["joints"].shape for observation in observations} == {(2, 3)}
-    with pytest.raises(StoppedError):
-        run(tmp_path / "cut", config, 5)
-    run(tmp_path / "cut", config)
-    run(tmp_path / "whole", config)
-    assert equal(weights(tmp_path / "whole"), weights(tmp_path / "cut"))
+    assert_resumed_equals_whole(tmp_path, config, 5)
 
 
 @pytest.mark.parametrize("task", ["reach", "push"])
 def test_actuated_joints_are_counted_as_batches_do(task):
     robots = [load_robot(name) for name in ("planar-cube", "nlink", "arm3", "arm=ur5 ee=rethink")]
     mask = build_robot_tables(robots).action_mask(fingers=TASKS[task].moves_fingers)
-    assert [num_actuated(robot, task) for robot in robots] == mask.sum(dim=1).tolist()
+    assert [training.num_actuated(robot, task) for robot in robots] == mask.sum(dim=1).tolist()
 
 
 def test_a_run_with_an_environment_for_every_robot_has_one_batch(tmp_path):
     config = drawn_config("cubes:2,stick:1", updates=6, slice_updates=0)
     run(tmp_path / "run", config)
-    assert sorted(tree(tmp_path / "run")) == [CHECKPOINT, "config.json", "metrics.jsonl", FILE]
+    files = [CHECKPOINT, "config.json", "metrics.jsonl", sources.FILE]
+    assert sorted(tree(tmp_path / "run")) == files
     assert read_config(tmp_path / "run") == config
     assert not TrainingBatches(config).changes_at(3)
 
 
 def test_runs_that_would_leave_robots_out_are_refused(tmp_path):
-    cases = [
-        (drawn_config(slice_updates=0), "--envs 4: fewer than the 6 robots"),
-        (drawn_config(updates=4), "only 4 of 6 robots would be trained on"),
-        (
-            replace(drawn_config(), policy=small_config(agent="se").policy),
-            "--agent se: learns one robot; --robots cubes:4,stick:2 needs an agent of many",
-        ),
-    ]
-    for config, error in cases:
-        with pytest.raises(TaskError, match=error):
-            run(tmp_path / "run", config)
-    with pytest.raises(BenchmarkError, match="has 5 links, more than max_links 4"):
-        run(tmp_path / "run", replace(drawn_config(), max_links=4))
     own = split((member("base=planar ee=cube"),), (member("base=gantry ee=plane"),))
     write_split(own, tmp_path / "own.yaml")
     held_out = drawn_config(held_out=[tmp_path / "own.yaml"])
-    with pytest.raises(BenchmarkError, match="test robot 'gantry-plane' has 7 links"):
-        run(tmp_path / "run", replace(held_out, max_links=6))
+    says_se = "--agent se: learns one robot; --robots cubes:4,stick:2 needs an agent of many"
+    for config, error in (
+        (drawn_config(slice_updates=0), "--envs 4: fewer than the 6 robots"),
+        (drawn_config(updates=4), "only 4 of 6 robots would be trained on"),
+        (replace(drawn_config(), policy=small_config(agent="se").policy), says_se),
+        (replace(drawn_config(), max_links=4), "has 5 links, more than max_links 4"),
+        (replace(held_out, max_links=6), "test robot 'gantry-plane' has 7 links"),
+    ):
+        with pytest.raises((TaskError, BenchmarkError), match=error):
+            run(tmp_path / "run", config)
     assert not (tmp_path / "run").exists()
 
 
@@ -527,7 +457,7 @@ def test_a_learner_continues_in_another_batch():
     agent = learner()
     agent.iterate()
     other = OnALine(8, seed=1)
-    use_batch(agent, other)
+    training.use_batch(agent, other)
     assert agent.batch is other
     before = other.state_dict()
     assert before == OnALine(8, seed=1).state_dict()  # nothing was drawn yet
@@ -539,15 +469,15 @@ def test_a_learner_continues_in_another_batch():
 def test_a_batch_that_does_not_fit_is_refused():
     agent = learner()
     with pytest.raises(TaskError, match="6 environments with discrete actions; expected 8"):
-        use_batch(agent, OnALine(6))
+        training.use_batch(agent, OnALine(6))
     with pytest.raises(TaskError, match="8 environments with continuous actions; expected 8 with"):
-        use_batch(agent, OnALine(8, kind="continuous"))
+        training.use_batch(agent, OnALine(8, kind="continuous"))
     agent = learner(agent="me-tf")
     larger = OnALine(8)
     observe = larger.observe
     larger.observe = lambda: {**observe(), "links": observe()["links"] | True}
     with pytest.raises(TaskError, match="a robot has 4 links; the learner has room for 3"):
-        use_batch(agent, larger)
+        training.use_batch(agent, larger)
 
 
 def test_goal_sets_are_reported_robot_by_robot():
@@ -566,14 +496,14 @@ FEW = GoalConfig(tasks=(ReachConfig(num_goals=3),))
 
 @pytest.fixture(autouse=True)
 def _nothing_drawn(monkeypatch):
-    monkeypatch.setattr(drawn_robots, "_drawn", {})
+    monkeypatch.setattr(sources, "_drawn", {})
 
 
 @pytest.fixture
 def grammar_file(tmp_path):
-    def write(*lines, name="mine"):
-        path = tmp_path / f"{name}.grammar"
-        path.write_text("\n".join(lines) + "\n")
+    def write(text):
+        path = tmp_path / "mine.grammar"
+        path.write_text(f"{text}\n")
         return path
 
     return write
@@ -585,13 +515,12 @@ def hashes(robots):
 
 def test_robots_are_those_of_sample_with_their_goals():
     source = drawn_source("cubes:3, stick:2", "reach", seed=4)
-    assert (source.name, num_drawn(source), tasks_of(source)) == ("cubes:3,stick:2", 5, ("reach",))
+    assert (source.name, sources.num_drawn(source)) == ("cubes:3,stick:2", 5)
+    assert sources.tasks_of(source) == ("reach",)
     robots = draw(source, FEW)
-    sampled = [
-        each.robot
-        for name, count in source.grammars
-        for each in sample_robots(shipped(name), LIBRARY, count, seed=4)
-    ]
+    sampled = []
+    for name, count in source.grammars:
+        sampled += [each.robot for each in sample_robots(shipped(name), LIBRARY, count, seed=4)]
     assert [each.name for each in robots.members] == [each.name for each in sampled]
     assert hashes(robots) == [robot_hash(each) for each in sampled]
     assert [each.category for each in robots.members] == ["cubes"] * 3 + ["stick"] * 2
@@ -615,8 +544,8 @@ def test_robots_depend_on_the_seed_and_not_on_their_number():
 def test_robots_do_not_depend_on_the_processes(monkeypatch):
     source = drawn_source("cubes:3", "reach")
     robots = draw(source, FEW)
-    monkeypatch.setattr(drawn_robots, "_drawn", {})
-    monkeypatch.setattr(drawn_robots, "ROBOTS_PER_JOB", 2)
+    monkeypatch.setattr(sources, "_drawn", {})
+    monkeypatch.setattr(sources, "ROBOTS_PER_JOB", 2)
     progress = []
     with show_progress(lambda *now: progress.append(now)):
         again = draw(source, FEW, jobs=2)
@@ -647,16 +576,14 @@ def test_equal_robots_are_drawn_once(grammar_file):
     assert len(set(hashes(robots))) == 2
     ((name, count),) = robots.skipped.items()
     assert (name, count > 0) == ("drawn before", True)
-    with pytest.raises(
-        TaskError, match="2 of 20 robots of mine can be used, expected 3; mine-0000"
-    ):
+    says = "2 of 20 robots of mine can be used, expected 3; mine-0000"
+    with pytest.raises(TaskError, match=says):
         draw(drawn_source(f"{path}:3", "reach"), FEW)
 
 
 def test_robots_that_cannot_do_the_task_are_skipped(grammar_file):
-    path = grammar_file(
-        "robot -> cubes(size=uniform(0.1, 0.2)) | cartpole(length=uniform(0.5, 1.5), mass=1)"
-    )
+    cartpole = "cartpole(length=uniform(0.5, 1.5), mass=1)"
+    path = grammar_file(f"robot -> cubes(size=uniform(0.1, 0.2)) | {cartpole}")
     robots = draw(drawn_source(f"{path}:3", "push"), GoalConfig())
     assert {spec.robot.dof for spec in robots.specs} == {2}
     assert robots.skipped.keys() == {"without goals"}
@@ -672,7 +599,7 @@ def test_grammar_files_are_named_by_their_absolute_path(grammar_file, monkeypatc
     assert source.name == "mine:2"
     robots = draw(source, FEW)
     grammar_file("robot -> cubes(size=uniform(0.1, 0.19))")
-    drawn_robots._drawn.clear()
+    sources._drawn.clear()
     with pytest.raises(TaskError, match="mine:2 with seed 0 have changed since the run began"):
         draw(replace(source, drawn_hash=robots.hash), FEW)
 
@@ -694,8 +621,8 @@ def test_malformed_requests_are_refused(request_text, error):
 
 def test_drawn_robots_have_no_test_side():
     source = drawn_source("cubes:2", "reach")
-    assert other_side(source, "train") is source
-    for refused in (lambda: other_side(source, "test"), lambda: specs_of(source, FEW)):
+    assert sources.other_side(source, "train") is source
+    for refused in (lambda: sources.other_side(source, "test"), lambda: specs_of(source, FEW)):
         with pytest.raises(TaskError, match="no test side: name other robots with --split"):
             refused()
 
@@ -703,28 +630,29 @@ def test_drawn_robots_have_no_test_side():
 def test_the_list_of_robots_builds_them_again(tmp_path):
     source = drawn_source("cubes:2,stick:1", "reach")
     robots = draw(source, FEW)
-    write_drawn(tmp_path, source, robots)
-    content = (tmp_path / FILE).read_bytes()
+    sources.write_drawn(tmp_path, source, robots)
+    content = (tmp_path / sources.FILE).read_bytes()
     data = json.loads(content)
     assert (data["robots"], data["seed"], data["hash"]) == (source.name, 0, robots.hash)
     assert data["held_out"] == split_names()
     assert data["held_out_bodies"] == list(robots.held_out)
-    assert read_drawn(tmp_path) == robots.members
-    write_drawn(tmp_path, source, robots)
-    assert (tmp_path / FILE).read_bytes() == content
+    assert sources.read_drawn(tmp_path) == robots.members
+    sources.write_drawn(tmp_path, source, robots)
+    assert (tmp_path / sources.FILE).read_bytes() == content
 
 
 def test_robots_that_were_trained_on_are_named(tmp_path):
     source = drawn_source("cubes:2", "reach")
     robots = draw(source, FEW)
-    write_drawn(tmp_path, source, robots)
+    sources.write_drawn(tmp_path, source, robots)
     drawn, new = replace(robots.members[0], name="a"), member("base=gantry ee=plane", name="b")
     test_side = split_source(split((new,), (drawn, new)), side="test")
-    assert trained_on(tmp_path, test_side) == ["a"]
-    assert trained_on(tmp_path, replace(test_side, side="train")) == []
+    assert sources.trained_on(tmp_path, test_side) == ["a"]
+    assert sources.trained_on(tmp_path, replace(test_side, side="train")) == []
     one = robot_source("planar-cube", "reach")
-    assert trained_on(tmp_path, one) == []
-    assert trained_on(tmp_path, replace(one, robot_hash=drawn.robot_hash)) == ["planar-cube"]
+    assert sources.trained_on(tmp_path, one) == []
+    same = replace(one, robot_hash=drawn.robot_hash)
+    assert sources.trained_on(tmp_path, same) == ["planar-cube"]
 
 
 @pytest.mark.parametrize(
@@ -740,6 +668,6 @@ def test_robots_that_were_trained_on_are_named(tmp_path):
 )
 def test_malformed_lists_are_refused(tmp_path, content, error):
     if content is not None:
-        (tmp_path / FILE).write_text(content)
+        (tmp_path / sources.FILE).write_text(content)
     with pytest.raises(TaskError, match=error):
-        read_drawn(tmp_path)
+        sources.read_drawn(tmp_path)
