@@ -2,8 +2,6 @@
 
 import os
 import shutil
-from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 
@@ -115,30 +113,19 @@ def viewer(folder, monkeypatch, thumbnails):
 
 
 @pytest.fixture
-def see(chromium, viewer, request):
+def see(chromium, viewer):
     """Open the page of a query, of a new viewer unless one is given."""
-    with _pages(chromium) as open_page:
-
-        def see_query(query="", *, on=None, width=1400, height=900):
-            on = on or viewer()
-            return open_page(f"http://127.0.0.1:{on.port}/{query}", width, height)
-
-        yield see_query
-
-
-@contextmanager
-def _pages(browser):
     contexts = []
 
-    def open_page(url, width, height):
-        context = browser.new_context(viewport={"width": width, "height": height})
-        context.set_default_timeout(WAIT)
-        contexts.append(context)
-        context.add_init_script(NO_WARNING)
-        page = context.new_page()
+    def open_page(query="", *, on=None, width=1400, height=900):
+        on = on or viewer()
+        contexts.append(chromium.new_context(viewport={"width": width, "height": height}))
+        contexts[-1].set_default_timeout(WAIT)
+        contexts[-1].add_init_script(NO_WARNING)
+        page = contexts[-1].new_page()
         page.failures = []
         page.on("pageerror", lambda error: page.failures.append(str(error)))
-        page.goto(url)
+        page.goto(f"http://127.0.0.1:{on.port}/{query}")
         return page
 
     yield open_page
@@ -147,13 +134,7 @@ def _pages(browser):
 
 
 @pytest.fixture
-def picture(request):
-    """Write a screenshot for a person to look at, if ``MORPHGEN_SCREENSHOTS`` names a folder."""
-    folder = os.environ.get("MORPHGEN_SCREENSHOTS")
-
-    def write(page, name=None):
-        if folder:
-            Path(folder).mkdir(parents=True, exist_ok=True)
-            page.screenshot(path=Path(folder) / f"{name or request.node.name}.png")
-
-    return write
+def quiet(capfd):
+    """Require that the viewer prints nothing, such as a traceback."""
+    yield
+    assert capfd.readouterr() == ("", "")

@@ -9,22 +9,14 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
-from morphgen.viewer.pages.compose import (
-    first_parts,
-    parameters_of,
-    slots_of,
-    split_words,
-    with_parameter,
-    with_word,
-    words_of,
-)
+from morphgen.viewer.pages import compose as pages
 
 LIBRARY = default_library()
 WORDS = "base=pedestal left.arm=ur5 left.ee=plane right.ee=stick left.ee.size=0.1 base.height=0.7"
 
 
 def changed(text, key, value):
-    return joined(with_word(split_words(text), key, value, LIBRARY))
+    return joined(pages.with_word(pages.split_words(text), key, value, LIBRARY))
 
 
 def joined(words):
@@ -57,7 +49,7 @@ def test_invalid_words_are_rejected(words, why, shared_viewer):
     ],
 )
 def test_parts_offer_slots_and_each_can_be_filled(words, slots):
-    assert slots_of(split_words(words), LIBRARY) == slots.split()
+    assert pages.slots_of(pages.split_words(words), LIBRARY) == slots.split()
     for slot in slots.split():
         part = "ur5" if slot.endswith("arm") else "stick"
         filled = changed(words, slot, part)
@@ -88,9 +80,8 @@ def test_a_robot_of_a_set_offers_the_grammar_of_the_set(shared_viewer):
 
 
 def test_every_parameter_has_a_slider_with_its_range(shared_viewer):
-    with PlainClient(
-        shared_viewer.port, "?compose=arm=arm3 base=pedestal arm.length=0.4"
-    ) as client:
+    query = "?compose=arm=arm3 base=pedestal arm.length=0.4"
+    with PlainClient(shared_viewer.port, query) as client:
         shown = sliders(client, "mount yaw (rad)")
         names = list(shown)
         assert names.index("mount yaw (rad)") > names.index("wrist")  # the base has no mount
@@ -115,7 +106,7 @@ TEMPLATES = [
 def test_every_part_accepts_both_ends_of_every_control(manifest):
     name, slot = manifest.name, manifest.kind
     words = f"{slot}={name}" + (" ee=stick" if slot == "base" else "")
-    for key, parameter in parameters_of(slot, name, LIBRARY).items():
+    for key, parameter in pages.parameters_of(slot, name, LIBRARY).items():
         for value in (parameter.minimum, parameter.maximum):
             parse_words(changed(words, f"{slot}.{key}", str(value)).split(), LIBRARY)
 
@@ -143,28 +134,29 @@ def test_derivation_is_built_part_by_part():
     derivation, name = parse_words(WORDS.split(), LIBRARY)
     whole = list(derivation.walk())
     for n in range(1, len(whole) + 1):
-        partial = first_parts(derivation, n)
+        partial = pages.first_parts(derivation, n)
         assert [node.label for node in partial.walk()] == [node.label for node in whole[:n]]
         assert compose(partial, LIBRARY, name).links
-    assert first_parts(derivation, 99) == derivation
+    assert pages.first_parts(derivation, 99) == derivation
 
 
 @pytest.mark.parametrize("words", [WORDS, "base=planar ee=cube", "arm=arm3 ee=claw ee.mount_yaw=1"])
 def test_a_derivation_of_words_is_edited_by_its_parts(words):
     derivation, _ = parse_words(words.split(), LIBRARY)
-    assert parse_words(joined(words_of(derivation, LIBRARY)).split(), LIBRARY)[0] == derivation
+    again = joined(pages.words_of(derivation, LIBRARY))
+    assert parse_words(again.split(), LIBRARY)[0] == derivation
 
 
 @pytest.mark.parametrize(
     "text", ["arm3=arm3(length=0.3)[flange: claw=claw]", "body=cubes(size=0.1, travel=1)"]
 )
 def test_a_derivation_of_another_shape_has_no_words(text):
-    assert words_of(parse_derivation(text), LIBRARY) is None
+    assert pages.words_of(parse_derivation(text), LIBRARY) is None
 
 
 def test_parameters_of_any_derivation_can_be_changed():
     derivation = parse_derivation("post=post(height=0.05)[top: beam1=beam(length=0.2)]")
-    changed = with_parameter(derivation, "beam1", "length", 0.3)
+    changed = pages.with_parameter(derivation, "beam1", "length", 0.3)
     assert str(changed) == "post=post(height=0.05)[top: beam1=beam(length=0.3)]"
 
 

@@ -22,19 +22,14 @@ from morphgen.splits.split_file import find_split, read_split
 from morphgen.viewer.app.address import AddressError, parse_address
 from morphgen.viewer.controls import all_roles, joint_roles, normalized_positions, with_roles
 from morphgen.viewer.figures import heatmap_svg, histogram_svg, map_svg
-from morphgen.viewer.pages import population as population_page
+from morphgen.viewer.pages import population as populations
 from morphgen.viewer.pages.compare import compare_robots, similarity_table
 from morphgen.viewer.pages.gallery import choose_sides, parse_range
 from morphgen.viewer.pages.population import (
     ReadRobot,
-    arrange,
     find_source,
-    format_selection,
     make_population,
-    move_roles,
-    parse_selection,
     read_robots,
-    selection_text,
     shape_poses,
 )
 from morphgen.viewer.robot_rows import Row
@@ -56,11 +51,9 @@ def test_the_library_counts_parts(shared_viewer):
     with PlainClient(shared_viewer.port, "?library=") as client:
         client.shows(" parts · page 1 of")
         client.control("Dropdown", "Kind of part")
-        (orders,) = [
-            message["props"]["options"]
-            for message in client.messages
-            if message["type"] == "GuiDropdownMessage" and message["props"]["label"] == "Sort by"
-        ]
+        kind = "GuiDropdownMessage"
+        dropdowns = [each["props"] for each in client.messages if each["type"] == kind]
+        (orders,) = [each["options"] for each in dropdowns if each["label"] == "Sort by"]
         assert {"name, Z to A", "reach, largest first", "kind of part, Z to A"} <= {*orders}
 
 
@@ -195,10 +188,9 @@ def test_an_empty_gallery_names_the_condition_that_excludes_all(shared_viewer):
 
 
 @pytest.mark.slow
-def test_conditions_are_cleared_from_an_empty_gallery(see, picture):
+def test_conditions_are_cleared_from_an_empty_gallery(see):
     page = see("?gallery=robots/prims&search=lost&dof=1..2")
     page.get_by_text("No robot passes the filter").wait_for()
-    picture(page, "gallery-empty")
     page.locator("tr", has_text="search: lost").get_by_text("clear").click()
     page.locator(".card").first.wait_for()
     page.wait_for_function("!location.search.includes('search')")
@@ -225,16 +217,14 @@ def test_a_gallery_shows_the_distributions_of_its_facts(shared_viewer):
 @pytest.fixture
 def population(folder, files):
     uris = [f"robots/prims/prims-{i:06d}" for i in range(6)] + ["robots/some-arm"]
-    read = []
-    for i, uri in enumerate(uris):
-        robot = read_robot_uri(uri, files)
-        read.append(ReadRobot(Row(uri, uri, order=i), robot, np.array(robot_bounds(robot))))
-    return make_population(read)
+    robots = [read_robot_uri(uri, files) for uri in uris]
+    bounds = [np.array(robot_bounds(robot)) for robot in robots]
+    rows = [Row(uri, uri, order=i) for i, uri in enumerate(uris)]
+    return make_population([ReadRobot(*each) for each in zip(rows, robots, bounds, strict=True)])
 
 
 def test_poses_of_all_robots_equal_those_of_each(population):
-    rng = np.random.default_rng(0)
-    q = rng.uniform(population.lower, population.upper)
+    q = np.random.default_rng(0).uniform(population.lower, population.upper)
     poses, instances = shape_poses(population, q), population.instances
     for i, robot in enumerate(population.robots):
         T_root_link = forward_kinematics(robot, q[i, : robot.dof])
@@ -252,24 +242,26 @@ def test_a_capsule_is_a_cylinder_and_two_balls():
 
 
 def test_a_role_moves_in_every_robot_by_the_same_share(population):
-    q = move_roles(population, population.home, {"joint 1": 1.0, "joint 2": 0.25})
+    q = populations.move_roles(population, population.home, {"joint 1": 1.0, "joint 2": 0.25})
     for i, robot in enumerate(population.robots):
         expected = with_roles(robot, np.array(robot.home), {"joint 1": 1.0, "joint 2": -0.5})
         np.testing.assert_allclose(q[i, : robot.dof], expected)
-    np.testing.assert_array_equal(move_roles(population, population.home, {}), population.home)
+    still = populations.move_roles(population, population.home, {})
+    np.testing.assert_array_equal(still, population.home)
+
+
+ARM = arm()
 
 
 def plain(sizes, reaches):
     """Return a population of robots without shapes that take boxes (n, 3) [m] on the ground."""
-    read = []
-    for i, (size, reach) in enumerate(zip(sizes, reaches, strict=True)):
-        bounds = np.array([np.zeros(3), size])
-        read.append(ReadRobot(Row(f"{i}", f"{i}", reach=reach, order=i), arm(), bounds))
-    return make_population(read)
+    rows = [Row(f"{i}", f"{i}", reach=reach, order=i) for i, reach in enumerate(reaches)]
+    bounds = [np.array([np.zeros(3), size]) for size in sizes]
+    return make_population([ReadRobot(row, ARM, b) for row, b in zip(rows, bounds, strict=True)])
 
 
 def test_rows_are_sorted_and_labelled_by_their_first_robot():
-    positions, labels = arrange(plain(np.ones((4, 3)), (3, 1, None, 2)), "reach")
+    positions, labels = populations.arrange(plain(np.ones((4, 3)), (3, 1, None, 2)), "reach")
     assert np.lexsort((positions[:, 0], -positions[:, 1])).tolist() == [1, 3, 0, 2]
     assert [text for text, _ in labels] == ["1 m", "3 m"]
 
@@ -277,7 +269,7 @@ def test_rows_are_sorted_and_labelled_by_their_first_robot():
 def test_robots_in_rows_take_their_own_width_so_that_a_large_one_does_not_spread_the_others():
     size = np.tile([0.3, 0.1, 0.2], (300, 1))
     size[::50] = [3.0, 0.1, 0.2]
-    places, labels = arrange(plain(size, [None] * len(size)))
+    places, labels = populations.arrange(plain(size, [None] * len(size)))
     assert labels == []
     left, right = places[:, 0], places[:, 0] + size[:, 0]
     for y in np.unique(places[:, 1]):
@@ -298,14 +290,9 @@ def test_a_camera_has_all_points_in_its_picture_and_touches_the_strictest_sides(
     assert (low[strictest], high[strictest]) == pytest.approx((-1, 1))
 
 
-def looking_down(height=5.0):
-    """A camera above the origin: right is x, up is y."""
-    axes = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
-    return View(np.array([0.0, 0.0, height]), axes, 1.0, 1.5)
-
-
 def test_points_are_projected_to_the_picture():
-    points, depth = project_points(looking_down(), np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]))
+    down = View(np.array([0.0, 0.0, 5.0]), np.diag([1.0, -1.0, -1.0]), 1.0, 1.5)
+    points, depth = project_points(down, np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]))
     np.testing.assert_allclose(points[0], (0.75, 0.5))
     assert points[1, 0] > 0.75
     assert points[2, 1] < 0.5
@@ -314,18 +301,18 @@ def test_points_are_projected_to_the_picture():
 
 def test_selections_survive_the_address():
     selected = np.array([True, True, True, False, False, True, False])
-    assert format_selection(selected) == "0-2,5"
-    np.testing.assert_array_equal(parse_selection("0-2,5", 7), selected)
-    assert not parse_selection("", 7).any()
-    assert parse_selection("5-99,x,3-", 7).tolist() == [False] * 5 + [True] * 2
-    assert format_selection(np.zeros(3, bool)) == ""
+    assert populations.format_selection(selected) == "0-2,5"
+    np.testing.assert_array_equal(populations.parse_selection("0-2,5", 7), selected)
+    assert not populations.parse_selection("", 7).any()
+    assert populations.parse_selection("5-99,x,3-", 7).tolist() == [False] * 5 + [True] * 2
+    assert populations.format_selection(np.zeros(3, bool)) == ""
 
 
 def test_the_text_of_a_selection_has_links_facts_and_ranges():
     one = Row("<img>", "x", reach=0.5, mass=2.0, dof=3, findings=("axis",))
-    text = selection_text([one])
+    text = populations.selection_text([one])
     assert '<a href="?robot=x">&lt;img&gt;</a> 3 DoF · 0.50 m · 2 kg axis' in text
-    many = selection_text([one, Row("b", "y", reach=0.7)] + 5 * [one])
+    many = populations.selection_text([one, Row("b", "y", reach=0.7)] + 5 * [one])
     assert "7 selected" in many
     assert "reach 0.5 to 0.7 m" in many
     assert "..." in many
@@ -379,7 +366,7 @@ def test_the_key_of_a_population_changes_with_its_files(folder, tmp_path):
 
 @pytest.mark.slow
 def test_a_large_population_says_that_it_has_no_shadows(shared_viewer, monkeypatch):
-    monkeypatch.setattr(population_page, "MAX_SHADOWS", 10)
+    monkeypatch.setattr(populations, "MAX_SHADOWS", 10)
     with PlainClient(shared_viewer.port, "?population=robots/prims") as client:
         client.shows("without shadows: more than 10 robots")
         batches = [m for m in client.messages if m["type"] == "BatchedMeshesMessage"]
@@ -419,16 +406,6 @@ def test_clicks_rectangles_and_buttons_select_robots(viewer):
         client.until(lambda: "select" not in client.addresses[-1][1])
         client.change(client.control("Button", "Choose"))
         client.shows("no robot is selected: drag a rectangle")
-
-
-@pytest.mark.slow
-def test_the_page_is_covered_until_its_content_is_there(see, picture):
-    page = see("?population=robots/prims")
-    assert page.locator("#morphgen-cover").count() == 1
-    page.locator("#morphgen-cover").wait_for(state="detached")
-    page.get_by_text("no robot is selected").wait_for()
-    picture(page, "population")
-    assert page.failures == []
 
 
 LIBRARY = default_library()
@@ -478,9 +455,8 @@ def test_positions_of_roles_are_clipped_or_left_out_and_shown_in_the_address(vie
         client.change(client.control("Slider", "joint 2"), 0.5)
         client.shows("joint1=-1&joint2=0.5")
         rotated = nodes(on)["/robot0/2"]
-        assert not np.allclose(rotated.position, before) or not np.allclose(
-            rotated.wxyz, [1, 0, 0, 0]
-        )
+        still = np.allclose(rotated.position, before) and np.allclose(rotated.wxyz, [1, 0, 0, 0])
+        assert not still
         client.change(client.control("ButtonGroup", "Go to"), "middle")
         client.shows("joint1=0&joint2=0&joint3=0&finger1=0")
         client.change(client.control("ButtonGroup", "Go to"), "home")
@@ -520,17 +496,15 @@ SPLIT = "extrapolation/primitives/reach"
 
 
 @pytest.mark.slow
-def test_split_page_shows_both_sides_the_map_and_the_audit(see, picture):
+def test_split_page_shows_both_sides_the_map_and_the_audit(see):
     page = see(f"?split={SPLIT}")
     page.get_by_text("train (10)").wait_for()
     page.get_by_text("test (2)").wait_for()
     page.wait_for_selector(".card:has-text('chain-000001') img")
-    picture(page, "split")
     at_work = page.get_by_role("link", name="see robots to test on at work").get_attribute("href")
     assert parse_address(at_work).subjects == ("reach",)
-    assert [robot.rpartition("/")[2] for robot in parse_address(at_work).robots] == [
-        member.name for member in read_split(find_split(SPLIT)).test
-    ]
+    test_names = [member.name for member in read_split(find_split(SPLIT)).test]
+    assert [uri.rpartition("/")[2] for uri in parse_address(at_work).robots] == test_names
     page.get_by_role("tab", name="Statistics").click()
     page.get_by_text("Cosine of test to train").wait_for()
     page.get_by_role("tab", name="Audit").click()
@@ -542,7 +516,6 @@ def test_split_page_shows_both_sides_the_map_and_the_audit(see, picture):
     point = page.locator("svg a", has=page.locator("title", has_text="chain-000001"))
     point.first.wait_for()
     page.locator("svg image").nth(11).wait_for()
-    picture(page, "split-map")
     point.first.locator("image").click()
     page.wait_for_url(re.compile(r"robot=split:.*chain-000001"))
     page.get_by_text("chain-000001").first.wait_for()
@@ -567,9 +540,8 @@ def test_new_split_is_saved_from_the_shown_robots(see, folder):
 
 def test_robots_of_a_set_become_members(folder, files, monkeypatch):
     monkeypatch.chdir(folder)
-    members = [
-        make_member(f"robots/prims/prims-{i:06d}", "prims", "push", False, files) for i in range(4)
-    ]
+    uris = [f"robots/prims/prims-{i:06d}" for i in range(4)]
+    members = [make_member(uri, "prims", "push", False, files) for uri in uris]
     path = save_split("mine/prims", "interpolation", members[:3], members[3:], files)
     split = read_split(path)
     assert split.train == tuple(members[:3])

@@ -9,7 +9,6 @@ import json
 import re
 import shlex
 import threading
-import time
 import weakref
 from dataclasses import replace
 from pathlib import Path
@@ -36,11 +35,7 @@ from morphgen.model.kinematics import joint_limits
 from morphgen.tasks.render.renderer import Renderer, RenderState
 from morphgen.tasks.sim.base import Scene
 from morphgen.viewer import film
-from morphgen.viewer.app.address import (
-    MAX_CHOSEN,
-    Address,
-    parse_address,
-)
+from morphgen.viewer.app.address import MAX_CHOSEN, Address, parse_address
 from morphgen.viewer.app.frame import page_links, shown_address, tray_html
 from morphgen.viewer.app.web_page import joint_sweep, joint_titles, robot_page
 
@@ -129,7 +124,7 @@ def test_a_turntable_is_a_video_of_one_turn(monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_page_opens_without_a_network(chromium, page, tmp_path, picture):
+def test_a_page_opens_without_a_network(chromium, page, tmp_path):
     path = tmp_path / "robot.html"
     path.write_bytes(page)
     context = chromium.new_context(viewport={"width": 1024, "height": 700}, offline=True)
@@ -140,16 +135,12 @@ def test_a_page_opens_without_a_network(chromium, page, tmp_path, picture):
     opened.on("request", lambda request: requests.append(request.url))
     opened.goto(path.as_uri())
     opened.locator("canvas").first.wait_for()
-    until = time.monotonic() + 100
-    while orange_pixels(opened) < 100 and time.monotonic() < until:  # the colour of the robot
-        opened.wait_for_timeout(1000)
-    assert orange_pixels(opened) >= 100
+    wait_until(lambda: orange_pixels(opened) >= 100)  # the colour of the robot
     time_field = opened.locator("input").first
     opened.wait_for_function("parseFloat(document.querySelector('input').value) > 1.5")
     opened.keyboard.press("Space")  # pauses; software GL draws slowly
     opened.wait_for_timeout(1000)
     paused = time_field.input_value()
-    picture(opened, "web-page")
     assert time_field.input_value() == paused
     context.close()
     assert failures == []
@@ -241,12 +232,8 @@ def test_a_script_chooses_robots(viewer):
         client.shows("1 chosen")
         assert script.send("choose", B) == 200
         client.shows("2 chosen")
-        client.until(
-            lambda: (
-                f"?population=&chosen={quote(A, safe='/=:')}&chosen={B}"
-                in dict(client.addresses).values()
-            )
-        )
+        shown = f"?population=&chosen={quote(A, safe='/=:')}&chosen={B}"
+        client.until(lambda: shown in dict(client.addresses).values())
         script.send("open", "?gallery=", visit=1)
         client.until(lambda: any(n == 1 and query.endswith(B) for n, query in client.addresses))
         script.send("drop", A)
@@ -268,14 +255,13 @@ def test_a_narrow_window_has_its_cards_above_the_panel(shared_viewer):
         assert html.count('class=\\"card\\"') == 24
 
 
-def test_a_script_shows_the_range_of_a_joint_and_of_no_other_number(shared_viewer, capfd):
+def test_a_script_shows_the_range_of_a_joint_and_of_no_other_number(shared_viewer, quiet):
     with PlainClient(shared_viewer.port, "?robot=robots/some-arm") as client:
         script = Script(client, shared_viewer.port)
         client.shows("no self-collision")
         for row in ("9" * 5000, "²", "0"):
             assert script.send("hover", row) == 200
         client.until(lambda: any(m.get("name", "").endswith("/range") for m in client.messages))
-    assert capfd.readouterr().err == ""
 
 
 def test_only_the_script_of_a_page_can_change_it(viewer):
@@ -290,16 +276,19 @@ def test_only_the_script_of_a_page_can_change_it(viewer):
         assert script.send("open", "?split=") == 404
 
 
-@pytest.mark.parametrize("page", ["gallery", "population", "split"])
-def test_pages_without_a_subject_list_what_there_is(shared_viewer, page):
-    with PlainClient(shared_viewer.port, f"?{page}=") as client:
-        client.shows(f"{page}=extrapolation/arms/reach" if page != "gallery" else "robots/prims")
-
-
-def test_playback_without_a_task_offers_tasks(shared_viewer):
-    with PlainClient(shared_viewer.port, f"?play=&chosen={B}") as client:
-        client.shows("Play which task?")
-        client.shows(f'href="?play=push&amp;robot={B}"')
+@pytest.mark.parametrize(
+    ("query", "text"),
+    [
+        ("?gallery=", "robots/prims"),
+        ("?population=", "population=extrapolation/arms/reach"),
+        ("?split=", "split=extrapolation/arms/reach"),
+        (f"?play=&chosen={B}", "Play which task?"),
+        (f"?play=&chosen={B}", f'href="?play=push&amp;robot={B}"'),
+    ],
+)
+def test_pages_without_a_subject_list_what_there_is(shared_viewer, query, text):
+    with PlainClient(shared_viewer.port, query) as client:
+        client.shows(text)
 
 
 def test_compare_without_robots_offers_a_picker(shared_viewer):
