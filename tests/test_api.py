@@ -17,26 +17,9 @@ from morphgen.cli import main
 from morphgen.errors import MorphgenError
 
 FUNCTIONS = (
-    "check",
-    "clone",
-    "compose",
-    "conform",
-    "demos",
-    "evaluate",
-    "export",
-    "fit",
-    "goals",
-    "make_env",
-    "play",
-    "read",
-    "record",
-    "sample",
-    "similarity",
-    "split",
-    "tokens",
-    "train",
-    "verify",
-    "write",
+    *("check", "clone", "compose", "conform", "demos", "evaluate", "export", "fit", "goals"),
+    *("make_env", "play", "read", "record", "sample", "similarity", "split", "tokens", "train"),
+    *("verify", "write"),
 )
 
 
@@ -74,11 +57,8 @@ def test_dir_lists_the_public_functions():
 
 def test_type_checkers_see_every_public_name():
     tree = ast.parse(Path(morphgen.__file__).read_text(encoding="utf-8"))
-    (block,) = (
-        node
-        for node in tree.body
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
-    )
+    conditions = [node for node in tree.body if isinstance(node, ast.If)]
+    (block,) = (each for each in conditions if ast.unparse(each.test) == "TYPE_CHECKING")
     imported = [node for node in block.body if isinstance(node, ast.ImportFrom)]
     modules = {alias.name: node.module for node in imported for alias in node.names}
     assert modules.pop("tasks") == "morphgen"
@@ -88,10 +68,8 @@ def test_type_checkers_see_every_public_name():
 
 def test_a_robot_prints_as_one_line():
     robot = morphgen.compose("lwr-plane")
-    assert (
-        repr(robot)
-        == f"Robot('lwr-plane': {len(robot.links)} links, 7 independent joints, 16.11 kg)"
-    )
+    facts = f"{len(robot.links)} links, 7 independent joints, 16.11 kg"
+    assert repr(robot) == f"Robot('lwr-plane': {facts})"
 
 
 EXAMPLES = {name: getattr(morphgen, name) for name in FUNCTIONS}
@@ -166,11 +144,8 @@ def test_a_split_is_chosen_written_built_audited_and_verified(tmp_path, monkeypa
     assert isinstance(split.definition.statistics["cosine"], dict)
     assert [len(side) for side in (split.train, split.test)] == [2, 2]
     file = split.write()
-    assert (str(file), split.write(), split.write("own.yaml").name) == (
-        "my/cubes.yaml",
-        file,
-        "own.yaml",
-    )
+    assert (str(file), split.write("own.yaml").name) == ("my/cubes.yaml", "own.yaml")
+    assert split.write() == file
     with pytest.raises(MorphgenError, match=r"own\.yaml exists with another content; choose"):
         morphgen.split("interpolation/arm3/reach").write("own.yaml")
     assert morphgen.split(file).definition == split.definition
@@ -237,7 +212,6 @@ held_out(max_links=None) => max_links None: expected
 check(3) => 3 is no robot; expected a Robot, a path, or a name
 conform("no/such/folder") => no/such/folder: no such file or folder
 conform("prims", samples=0) => samples 0: expected a whole number, 1
-conform("prims", samples=1.5) => samples 1.5: expected a whole number
 conform("prims", seed=None) => seed None: expected a whole number, 0
 compose(Path("ur5")) => expected words, such as ur5-plane
 compose("prims", library=None) => library None: expected a folder, or
@@ -248,9 +222,7 @@ held_out(task=None) => split: task None: expected a text
 sample(".", 1) => unknown grammar '.'
 similarity(["prims", "prims"], []) => no measure is named; valid: cos
 tokens("arm3-stick", max_links=23.5) => max_links 23.5: expected a whole
-held_out(seed=1.5) => split: seed 1.5: expected a whole number
 held_out(seed=True) => split: seed True: expected a whole number
-held_out(test="1") => split: test '1': expected a whole number
 held_out(obstacles="no") => split: obstacles 'no': expected True or False
 prims_env(obstacles="no") => obstacles 'no': expected True or False
 prims_env(goal_seed=1.5) => goal seed 1.5: expected a whole number, 0
@@ -261,12 +233,8 @@ prims_env(num_envs="2") => number of environments '2': expected a
 prims_env(num_envs=1, seed="x") => seed 'x': expected a whole numb
 prims_env(num_envs=1, configs=3) => configs 3: expected a list
 prims_env(num_envs=1, configs=[3]) => config int: its task None is unknown
-fit("arm3-stick", max_primitives=0) => 0 primitives: expected 1 to 32
-fit("none.stl") => none.stl
-tokens("arm3-stick", max_links=2) => more than max_links 2
 similarity("arm3-stick") => 1 robots to compare; expected a list
 similarity(["prims", "z1"], ["tee"]) => did you mean 'tree'
-split("interpolation/arm3") => did you mean 'interpolation/arm3/
 split() => no split is named; expected a name, or hold_out or regime
 split("a", test=2) => hold-out: hold_out is missing; valid: hold_out, ro
 split(hold_out="arm=lwrr") => no arm matches 'lwrr'; did you mean 'lwr'
@@ -274,7 +242,6 @@ held_out(hull="any") => hold-out: no effect of hull; va
 split(regime="composed") => unknown regime 'composed'; did you mean 'com
 split(regime="interpolation", grammar=["arm3", "arm5"]) => 2 grammars
 held_out(task="reech") => unknown task 'reech'; did yo
-held_out(task=[]) => expected one or more, all differe
 split("../a", hold_out="arm=lwr") => name '../a': use letters, digits
 split(holdout="arm=lwr") => argument 'holdout'; did you mean 'hold_out'
 make_env("reech") => did you mean 'reach'
@@ -288,14 +255,10 @@ export("prims", "gltf") => unknown format 'gltf'; did you mean 'glb'
 export("prims", "gif", dark=True) => dark: only with format html
 export("prims", "glb", seed=0) => seed: only with format srdf or curobo or ros2
 export("prims", "urdf", cover=0.9) => cover: only with spheres
-export("prims", "urdf", spheres=40) => 40 spheres: expected 1 to 32
 train("prims") => prims: no such file, and no split of this name
-train("prims task=rich") => unknown task 'rich'
-train("prims task=reach", seed=-1) => seed -1: expected a whole number, 0 or more
 train("prims task=reach", steps="9") => steps '9': expected a whole number, 1
 train("prims task=reach", sim="mujco") => did you mean 'mujoco'
 train("prims task=reach", agent=None, sim=3) => sim 3: expected a text
-train("prims task=reach", constants={"gama": 1}) => did you mean 'gamma'
 train("prims task=reach", robot_seed=1) => only with drawn
 evaluate("ik", "prims task=reach", mode="best") => unknown mode 'best'; valid: deter
 evaluate("ik", "prims task=reach", episodes=0) => episodes 0: expected a whole num
@@ -305,9 +268,13 @@ evaluate("zero-shot", "prims task=reach", on="tests") => unknown side 'tests'
 play("reach", "prims", episodes=0) => episodes 0: expected a whole number, 1
 play("push", "prims", policy="ik") => valid: scripted, zero, random
 play("reach", "prims", kind="binary") => binary
-goals("prims", task="reech") => did you mean 'reach'
 goals("arm=ur5 ee=stick") => name one split, or say --task for a robot
 goals("interpolation/arm3/reach", obstacles=True) => obstacles: only with task
+compose("ur5", "plane") => expected compose(request='', *, name=None, geom
+compose(arm=None) => arm None: expected a text or a number
+write("prims") => write: missing a required argument: 'folder'; expec
+write("prims", 5) => folder 5: expected a path
+read("x", rot="y") => read: got an unexpected keyword argument 'rot'; ex
 """
 """Calls of public functions that are refused, and part of the reason."""
 
@@ -357,23 +324,9 @@ def test_values_that_are_no_texts_give_one_clear_error(call):
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_arguments_that_a_function_lacks_are_named_with_those_that_it_has(name):
     function = getattr(morphgen, name)
+    says = rf"^{name}: too many positional .*; expected {name}\("
     for arguments in (range(9), ("ur5", "plane", "robots", "more", "and", "more")):
-        with pytest.raises(
-            MorphgenError, match=rf"^{name}: too many positional .*; expected {name}\("
-        ) as caught:
+        with pytest.raises(MorphgenError, match=says) as caught:
             function(*arguments)
         assert isinstance(caught.value, TypeError)
     assert pickle.loads(pickle.dumps(function)) is function
-
-
-def test_the_signature_of_compose_is_shown():
-    with pytest.raises(MorphgenError, match=r"expected compose\(request='', \*, name=None, geom"):
-        morphgen.compose("ur5", "plane")
-    with pytest.raises(MorphgenError, match=r"write: missing a required argument: 'folder'; expec"):
-        morphgen.write("prims")
-    with pytest.raises(MorphgenError, match="folder 5: expected a path"):
-        morphgen.write("prims", 5)
-    with pytest.raises(MorphgenError, match="arm None: expected a text or a number"):
-        morphgen.compose(arm=None)
-    with pytest.raises(MorphgenError, match=r"^read: got an unexpected keyword argument 'rot'; ex"):
-        morphgen.read("x", rot="y")

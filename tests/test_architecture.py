@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -23,28 +24,9 @@ FOLDERS = [
 ]
 """Folders of modules; a source distribution has ``tasks`` only as ``morphgen/tasks``."""
 PACKAGES = (
-    "errors",
-    "arguments",
-    "extras",
-    "typing",
-    "files",
-    "progress",
-    "processes",
-    "tables",
-    "model",
-    "formats",
-    "checks",
-    "grammar",
-    "fitting",
-    "encoding",
-    "splits",
-    "tasks",
-    "rl",
-    "benchmark",
-    "viewer",
-    "api",
-    "doctor",
-    "cli",
+    *("errors", "arguments", "extras", "typing", "files", "progress", "processes", "tables"),
+    *("model", "formats", "checks", "grammar", "fitting", "encoding", "splits"),
+    *("tasks", "rl", "benchmark", "viewer", "api", "doctor", "cli"),
 )
 """Packages and modules of morphgen, the lowest first; each may import itself and those below."""
 MODULES = sorted(
@@ -57,16 +39,8 @@ COMMAND_LINE_USERS = (
     PACKAGE / "__main__.py",
     ROOT / "docs" / "site" / "hooks.py",  # writes the reference of the commands
 )
-SIMULATORS_AND_MESHES = (
-    "coacd",
-    "manifold3d",
-    "mujoco",
-    "pybullet",
-    "torch",
-    "trimesh",
-    "viser",
-    "yourdfpy",
-)
+HEAVY = ("coacd", "manifold3d", "mujoco", "pybullet", "torch", "trimesh", "viser", "yourdfpy")
+"""Packages of simulators, meshes and networks."""
 
 
 def name_of(path):
@@ -77,8 +51,13 @@ def name_of(path):
 NAMES = {name_of(path): path for path in MODULES}
 
 
+@cache
 def imports(path):
     """Return the modules that a module imports anywhere in its code."""
+    return set(imported(path))
+
+
+def imported(path):
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -94,23 +73,21 @@ def package_of(module):
     return below.partition(".")[0]
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_imports_go_down_only(path):
-    own = package_of(name_of(path))
-    if own not in PACKAGES:  # morphgen/__init__.py and data folders
-        return
-    allowed = PACKAGES[: PACKAGES.index(own) + 1]
-    for module in imports(path):
-        if module.startswith("morphgen."):
-            assert package_of(module) in allowed, f"{name_of(path)} imports {module}"
+def test_imports_go_down_only():
+    upwards = [
+        f"{name} imports {module}"
+        for name, path in NAMES.items()
+        if (own := package_of(name)) in PACKAGES  # not morphgen/__init__.py and data folders
+        for module in imports(path)
+        if module.startswith("morphgen.")
+        and package_of(module) not in PACKAGES[: PACKAGES.index(own) + 1]
+    ]
+    assert upwards == []
 
 
 def test_imports_have_no_cycles():
-    graph = {
-        name: {module for module in imports(path) if module in NAMES and module != name}
-        for name, path in NAMES.items()
-        if name != "morphgen"
-    }
+    modules = {*NAMES} - {"morphgen"}
+    graph = {name: (imports(NAMES[name]) & {*NAMES}) - {name} for name in modules}
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
@@ -119,14 +96,9 @@ def test_imports_have_no_cycles():
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 def test_no_module_imports_the_top_level_package(folder):
-    modules = folder.rglob("*.py")
-    outside = [
-        path
-        for path in modules
-        if PACKAGE / "cli" not in path.parents and path not in COMMAND_LINE_USERS
-    ]
-    guilty = [str(path) for path in outside if "morphgen.cli" in set(imports(path))]
-    assert guilty == []
+    users = [path for path in folder.rglob("*.py") if "morphgen.cli" in imports(path)]
+    below = [path for path in users if PACKAGE / "cli" not in path.parents]
+    assert {*below} <= {*COMMAND_LINE_USERS}
 
 
 def test_every_package_has_a_layer():
@@ -148,17 +120,32 @@ def modules_after(statement):
     return set(done.stdout.split())
 
 
-@pytest.mark.parametrize("statement", ["import morphgen", "import morphgen.cli"])
-def test_top_level_import_loads_no_heavy_package(statement):
-    loaded = modules_after(statement)
-    assert "morphgen" in loaded
-    assert loaded.isdisjoint({*SIMULATORS_AND_MESHES, "numpy", "scipy", "lxml", "yaml"})
+SPLITS_AND_GOALS = (
+    "benchmark.split_folder fitting.token_shapes model.kinematics tasks.scenes.env_specs"
+)
 
 
-@pytest.mark.parametrize("module", ["grammar.library", "cli.lists"])
-def test_reading_manifests_loads_no_simulator(module):
-    loaded = modules_after(f"import morphgen.{module}")
-    assert loaded.isdisjoint(SIMULATORS_AND_MESHES)
+@pytest.mark.parametrize(
+    ("modules", "needed", "others"),
+    [
+        ("morphgen", "morphgen", (*HEAVY, "numpy", "scipy", "lxml", "yaml")),
+        ("morphgen.cli", "morphgen", (*HEAVY, "numpy", "scipy", "lxml", "yaml")),
+        ("morphgen.grammar.library", "yaml", HEAVY),
+        ("morphgen.cli.lists", "morphgen", HEAVY),
+        ("morphgen.checks", "numpy", (*HEAVY, "fcl", "igl", "lxml", "scipy")),
+        (", ".join(f"morphgen.{name}" for name in SPLITS_AND_GOALS.split()), "mujoco", ["torch"]),
+        pytest.param(
+            "morphgen.tasks.sim.bullet_batch",
+            "pybullet",
+            {*HEAVY, "scipy", "lxml"} - {"pybullet"},
+            marks=needs_pybullet,
+        ),
+    ],
+)
+def test_importing_modules_loads_only_the_packages_that_they_need(modules, needed, others):
+    loaded = modules_after(f"import {modules}")
+    assert needed in loaded
+    assert loaded.isdisjoint(others)
 
 
 def modules_of_command(folder, *words):
@@ -167,14 +154,9 @@ def modules_of_command(folder, *words):
         "import sys; from morphgen.cli import main; code = main(sys.argv[1:]); "
         "print(*sorted(sys.modules)); sys.exit(code)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, *words],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=folder,
-        env={**os.environ, "XDG_CACHE_HOME": str(folder / "cache")},
-    )
+    options = {"env": {**os.environ, "XDG_CACHE_HOME": str(folder / "cache")}, "cwd": folder}
+    command = [sys.executable, "-c", code, *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, **options)
     return set(done.stdout.splitlines()[-1].split())
 
 
@@ -182,7 +164,7 @@ def test_a_list_loads_neither_numpy_nor_a_parser(tmp_path):
     loaded = modules_of_command(tmp_path, "list", "arms")
     assert "morphgen.cli.lists" in loaded
     others = {"numpy", "lark", "lxml", "tqdm", "multiprocessing", "morphgen.model.robot"}
-    assert loaded.isdisjoint({*SIMULATORS_AND_MESHES, *others})
+    assert loaded.isdisjoint({*HEAVY, *others})
 
 
 @pytest.mark.slow
@@ -192,27 +174,9 @@ def test_composing_loads_no_reader_of_what_is_kept(tmp_path):
     heavy = {"trimesh", "scipy", "networkx", "PIL", "xacro", "xml.dom", "morphgen.formats._xacro"}
     assert {"trimesh", "scipy", "morphgen.formats._xacro"} <= first
     assert {"mujoco", "morphgen.formats.bundle"} <= again
-    assert again.isdisjoint({*heavy, *SIMULATORS_AND_MESHES, "igl", "tqdm"} - {"mujoco"})
+    assert again.isdisjoint({*heavy, *HEAVY, "igl", "tqdm"} - {"mujoco"})
     rooms = ("fitting", "formats.mjcf.read", "model.mesh_files", "grammar.robot_source")
     assert again.isdisjoint(f"morphgen.{room}" for room in rooms)
-
-
-def test_importing_the_checks_loads_no_simulator():
-    loaded = modules_after("import morphgen.checks")
-    assert loaded.isdisjoint({*SIMULATORS_AND_MESHES, "fcl", "igl", "lxml", "scipy"})
-
-
-@needs_pybullet
-def test_pybullet_processes_load_few_packages():
-    loaded = modules_after("import morphgen.tasks.sim.bullet_batch")
-    assert "pybullet" in loaded
-    assert loaded.isdisjoint({*SIMULATORS_AND_MESHES, "scipy", "lxml"} - {"pybullet"})
-
-
-def test_splits_and_goals_do_not_import_torch():
-    names = "benchmark.split_folder fitting.token_shapes model.kinematics tasks.scenes.env_specs"
-    modules = [f"morphgen.{name}" for name in names.split()]
-    assert "torch" not in modules_after(f"import {', '.join(modules)}")
 
 
 WITHOUT_EXTRAS = """
@@ -235,49 +199,28 @@ def python_without_extras(folder, statements, *words):
     return subprocess.run(command, capture_output=True, text=True, cwd=folder)
 
 
-def run_without_extras(folder, *words):
-    return python_without_extras(folder, WITHOUT_PROGRESS, *words)
-
-
-CORE_COMMANDS = (
-    ("compose", "arm=ur5", "--geometry", "primitive"),
-    ("sample", "chain", "-n", "1"),
-    ("check", "arm3-stick"),
-    ("tokens", "ur5-plane"),
-    ("similarity", "prims", "stick"),
-    ("conform", "prims"),
-    ("doctor",),
-    ("split", "show", "interpolation/panda/reach"),
+SLOW_COMMANDS = (
+    *("compose arm=ur5 --geometry primitive", "sample chain -n 1", "check arm3-stick", "doctor"),
+    *("tokens ur5-plane", "similarity prims stick", "conform prims"),
+    "split show interpolation/panda/reach",
 )
 
 
 @pytest.mark.parametrize(
-    "words",
-    [
-        pytest.param(("demo",), id="demo"),
-        *(
-            pytest.param(words, id=" ".join(words), marks=pytest.mark.slow)
-            for words in CORE_COMMANDS
-        ),
-    ],
+    "command", ["demo", *(pytest.param(each, marks=pytest.mark.slow) for each in SLOW_COMMANDS)]
 )
-def test_core_works_without_optional_extras(words, tmp_path):
-    done = run_without_extras(tmp_path, *words)
+def test_core_works_without_optional_extras(command, tmp_path):
+    done = python_without_extras(tmp_path, WITHOUT_PROGRESS, *command.split())
     assert (done.returncode, done.stderr) == (0, "")
 
 
 MISSING = {
-    "fit ur5": "fit",
-    "compose arm=ur5 --geometry convex": "convex",
-    "export prims --format usd": "usd",
-    "train interpolation/arm3/reach": "rl",
-    "finetune zero-shot": "rl",
-    "play reach prims": "tasks",
-    "speed reach prims": "tasks",
-    "view": "viewer",
-    'fit("z1")': "fit",
-    'make_env("reach", "prims")': "tasks",
-    'train("prims task=reach")': "rl",
+    **{"fit ur5": "fit", "compose arm=ur5 --geometry convex": "convex", 'fit("z1")': "fit"},
+    **{"export prims --format usd": "usd", "view": "viewer", "finetune zero-shot": "rl"},
+    **{"train interpolation/arm3/reach": "rl", 'train("prims task=reach")': "rl"},
+    **dict.fromkeys(
+        ("play reach prims", "speed reach prims", 'make_env("reach", "prims")'), "tasks"
+    ),
 }
 """Extra that a command, or a call of ``import morphgen``, needs."""
 TRIED_WITHOUT = """

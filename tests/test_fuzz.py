@@ -11,36 +11,15 @@ from hypothesis import strategies as st
 
 import morphgen
 from helpers.fuzzing import MEMORY_MIB, Runner
+from helpers.robots import arm
+from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar.grammar_file import grammar_names
 
 TEMPLATES = Path(morphgen.__file__).parent / "templates"
 
-ROBOT = """<?xml version="1.0"?>
-<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">
-  <material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>
-  <link name="base">
-    <inertial>
-      <origin xyz="0 0 0.1" rpy="0 0 0"/><mass value="1.5"/>
-      <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/>
-    </inertial>
-    <visual><geometry><box size="0.1 0.2 0.3"/></geometry><material name="grey"/></visual>
-    <collision><geometry><cylinder radius="0.1" length="0.2"/></geometry></collision>
-  </link>
-  <joint name="turn" type="revolute">
-    <parent link="base"/><child link="tip"/><origin xyz="0 0 0.3" rpy="0 1.57 0"/>
-    <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="10" velocity="2"/>
-  </joint>
-  <link name="tip">
-    <collision><geometry><sphere radius="0.05"/></geometry></collision>
-    <collision><geometry><mesh filename="meshes/none.stl"/></geometry></collision>
-  </link>
-  <joint name="finger" type="prismatic">
-    <parent link="tip"/><child link="nail"/><limit lower="0" upper="0.1" effort="1" velocity="1"/>
-    <mimic joint="turn" multiplier="2"/>
-  </joint>
-  <link name="nail"/>
-</robot>
-"""
+ROBOT = urdf_text(arm(), str).replace(
+    "</link>", '<collision><geometry><mesh filename="a/b.stl"/></geometry></collision></link>', 1
+)
 
 MODEL = """<mujoco model="m">
   <compiler angle="radian" autolimits="true"/>
@@ -68,31 +47,11 @@ MODEL = """<mujoco model="m">
 """
 
 STRANGE = [
-    "",
-    "0",
-    "-1",
-    "nan",
-    "inf",
-    "-0",
-    "1e308",
-    "1e-320",
-    "9" * 400,
-    "1 2",
-    "1 2 3",
-    "0 0 0",
-    "base",
-    "tip",
-    "${1/0}",
-    "../../x",
-    "/dev/zero",
-    "\u0000",
-    "\n",
-    "\u202e",
-    "é",
-    "floating",
-    "continuous",
-    "A" * 3000,
+    *("", "0", "-1", "nan", "inf", "-0", "1e308", "1e-320", "9" * 400, "1 2", "1 2 3", "0 0 0"),
+    *("upper", "lower", "floating", "continuous", "A" * 3000, "${1/0}", "../../x", "/dev/zero"),
+    *("\u0000", "\n", "\u202e", "é"),
 ]
+TAGS = ["<", ">", "</link>", "<!--", "<![CDATA[", '<!DOCTYPE r SYSTEM "x">', "&a;", "<a:b/>"]
 
 ATOMS = (  # noqa: SIM905
     "1;0;2.5;-1;10**9;1e308;'a';'';[];[1, 2];{};{'a': 1};();True;None;pi;x;math;math.pi;xacro;"
@@ -158,17 +117,7 @@ def broken_xml(draw, text):
         start, end = values[first] + 1, values[first + 1]
         text = text[:start] + draw(st.sampled_from(STRANGE)) + text[end:]
     if draw(st.booleans()):
-        tags = [
-            "<",
-            ">",
-            "</link>",
-            "<!--",
-            "<![CDATA[",
-            '<!DOCTYPE r SYSTEM "x">',
-            "&a;",
-            "<a:b/>",
-        ]
-        text = draw(mutated(text, tags))
+        text = draw(mutated(text, TAGS))
     data = text.encode(draw(st.sampled_from(["utf-8", "utf-8", "utf-16", "utf-8-sig"])))
     for _ in range(draw(st.integers(0, 3))):
         where = draw(st.integers(0, len(data)))
@@ -181,30 +130,10 @@ GRAMMARS = [
     for name in sorted(grammar_names())
 ]
 WORDS = [
-    "{1,1000000000}",
-    "{999999999}",
-    "{0,0}",
-    "robot -> robot robot\n",
-    "| robot robot",
-    "not " * 50,
-    "(" * 2000,
-    "-" * 2000,
-    "1+" * 2000,
-    "1e400",
-    "9" * 5000,
-    "uniform(1, 0)",
-    "uniform(0, 1e308)",
-    "where ",
-    "let a = a\n",
-    'include "/etc/hostname"\n',
-    "include arm3\n",
-    "@weight(0)",
-    "ur5",
-    "plane",
-    "\x00",
-    "->",
-    "\n",
-    "mount_yaw=1",
+    *("{1,1000000000}", "{999999999}", "{0,0}", "robot -> robot robot\n", "| robot robot"),
+    *("not " * 50, "(" * 2000, "-" * 2000, "1+" * 2000, "1e400", "9" * 5000, "\x00", "->", "\n"),
+    *("uniform(1, 0)", "uniform(0, 1e308)", "where ", "let a = a\n", 'include "/etc/hostname"\n'),
+    *("include arm3\n", "@weight(0)", "ur5", "plane", "mount_yaw=1"),
 ]
 grammars = st.sampled_from(GRAMMARS).flatmap(lambda text: mutated(text, WORDS))
 
@@ -226,12 +155,8 @@ def require_good_manners(answer, context):
 
 
 def manners(max_examples):
-    return settings(
-        max_examples=max_examples,
-        derandomize=True,
-        database=None,
-        suppress_health_check=list(HealthCheck),
-    )
+    same = {"derandomize": True, "database": None, "suppress_health_check": list(HealthCheck)}
+    return settings(max_examples=max_examples, **same)
 
 
 @pytest.mark.slow

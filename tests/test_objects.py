@@ -31,17 +31,11 @@ OBJECTS = LIBRARY.names("object")
 def corners(name):
     """Return values of parameters: the defaults, all smallest, all largest, and random corners."""
     parameters = LIBRARY.manifest(name).parameters
-    ends = np.random.default_rng(0).integers(2, size=(6, len(parameters)))
-    return [
-        {},
-        *(
-            {
-                key: each.maximum if end else each.minimum
-                for (key, each), end in zip(parameters.items(), row, strict=True)
-            }
-            for row in ([0] * len(parameters), [1] * len(parameters), *ends.tolist())
-        ),
-    ]
+    ranges = np.array([(each.minimum, each.maximum) for each in parameters.values()])
+    drawn = np.random.default_rng(0).integers(2, size=(6, len(ranges)))
+    ends = [np.zeros_like(drawn[0]), np.ones_like(drawn[0]), *drawn]
+    values = [ranges[np.arange(len(ranges)), row].tolist() for row in ends]
+    return [{}, *(dict(zip(parameters, row, strict=True)) for row in values)]
 
 
 def composed(name, values):
@@ -79,9 +73,8 @@ def test_object_is_sound_over_the_ranges_of_its_parameters(name):
 def test_urdf_of_an_object_keeps_its_joint(name, tmp_path):
     body, _ = composed(name, {})
     (tmp_path / "a.urdf").write_text(urdf_text(body, str))
-    before, after = (
-        robot.joints[robot.movable_joints[0]] for robot in (body, read_urdf(tmp_path / "a.urdf"))
-    )
+    robots = (body, read_urdf(tmp_path / "a.urdf"))
+    before, after = (robot.joints[robot.movable_joints[0]] for robot in robots)
     for key in ("limits", "effort", "velocity", "damping", "friction"):
         assert getattr(after, key) == pytest.approx(getattr(before, key)), key
 
@@ -224,6 +217,5 @@ def test_a_short_list_is_complete(name, valid, hint):
 
 
 def test_the_closest_name_may_be_unlisted():
-    assert (
-        nearest("ee_size", ["arm", "ee"], ["ee.size"]) == "; did you mean 'ee.size'? valid: arm, ee"
-    )
+    hint = "; did you mean 'ee.size'? valid: arm, ee"
+    assert nearest("ee_size", ["arm", "ee"], ["ee.size"]) == hint
