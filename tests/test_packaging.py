@@ -63,6 +63,13 @@ def test_the_workflow_runs_what_the_script_runs_on_every_python():
     assert set().union(*targets.values(), make_targets(scripts["dist"])) <= set(phony.split())
 
 
+@pytest.mark.parametrize("name", ["bug", "part", "question"])
+def test_issue_forms_have_fields_with_a_label(name):
+    form = read_yaml(f".github/ISSUE_TEMPLATE/{name}.yml")
+    assert {"name", "description", "body"} <= set(form)
+    assert all(field["attributes"]["label"] for field in form["body"])
+
+
 @pytest.mark.slow
 def test_distributions_have_all_files(tmp_path):
     """The source distribution has what the tests need; the wheel has the package and its data."""

@@ -7,7 +7,7 @@ import pytest
 
 from helpers.grammars import CATEGORIES, LIBRARY, shipped
 from morphgen.checks import check
-from morphgen.grammar.manifest import Manifest
+from morphgen.grammar.manifest import PART_KINDS, Manifest
 from morphgen.grammar.part import load_part
 from morphgen.grammar.sampling import sample_robot
 from morphgen.model.inertia import inertial_from_density, union_volume
@@ -15,6 +15,10 @@ from morphgen.model.kinematics import forward_kinematics, random_configurations
 from morphgen.model.robot import Robot
 
 TEMPLATES = [manifest for manifest in LIBRARY.manifests() if manifest.is_template]
+
+
+def test_templates_of_every_kind_exist():
+    assert {manifest.kind for manifest in TEMPLATES} == {*PART_KINDS}
 
 
 def extremes(manifest: Manifest) -> Iterator[dict[str, float]]:

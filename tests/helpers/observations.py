@@ -13,12 +13,10 @@ from morphgen.tasks.observation import tree_entries
 
 N, LINKS, OBSTACLES, POINTS = 4, 6, 3, 8
 COUNT = torch.tensor([6, 4, 1, 3])
-MASKS = dict.fromkeys(("tokens", "velocity", "previous_action", "lag", "jacobian"), "links") | {
-    "goal": "goal_mask",
-    "object": "object_mask",
-    "line": "object_mask",
-    "obstacles": "obstacle_mask",
-    "points": "point_mask",
+MASKS = {
+    **dict.fromkeys(("tokens", "velocity", "previous_action", "lag", "jacobian"), "links"),
+    **{"goal": "goal_mask", "object": "object_mask", "line": "object_mask"},
+    **{"obstacles": "obstacle_mask", "points": "point_mask"},
 }
 """Mask of the rows of each observation entry."""
 
@@ -77,13 +75,9 @@ def filled(seen, value):
 def networks(agent="me-tf", seen=None, *, discrete=True, proprioceptive_only=False, lively=True):
     """Return an actor and a critic; ``lively`` ones have noise on the initial weights."""
     layout = layout_of(seen or observed())
-    config = PolicyConfig(
-        agent=agent,
-        discrete=discrete,
-        proprioceptive_only=proprioceptive_only,
-        tool_position=layout.tool,
-        network=transformer.Config(logit_scale=1.0) if agent == "me-tf" else None,
-    )
+    network = transformer.Config(logit_scale=1.0) if agent == "me-tf" else None
+    options = {"proprioceptive_only": proprioceptive_only, "tool_position": layout.tool}
+    config = PolicyConfig(agent=agent, discrete=discrete, network=network, **options)
     actor, critic = make_networks(config, layout, seed=0)
     if lively:
         generator = torch.Generator().manual_seed(1)
