@@ -85,17 +85,6 @@ def test_allow_list_applies_wherever_expressions_occur(refused, hostile, body):
     assert "Lambda 'lambda: 0' is not allowed" in message or "invalid expression" in message
 
 
-def test_allow_list_applies_to_yaml_units(refused_at, hostile):
-    (hostile("").parent / "units.yaml").write_text("a: !degrees (lambda:0)()\n")
-    assert "Lambda 'lambda:0' is not allowed" in refused_at(link("xacro.load_yaml('units.yaml')"))
-
-
-def test_yaml_tags_construct_no_objects(refused_at, hostile):
-    text = "a: !!python/object/apply:os.system ['touch pwned']\n"
-    (hostile("").parent / "tags.yaml").write_text(text)
-    assert "tags.yaml:1:4: invalid YAML" in refused_at(link("xacro.load_yaml('tags.yaml')"))
-
-
 @pytest.mark.parametrize(
     "name", ["../secret.yaml", "{home}/secret.yaml", "link.yaml", "up/secret.yaml"]
 )
@@ -189,9 +178,11 @@ def aliases(depth):
         ),
         ("[" * 1500, "invalid YAML"),
         ("a: !!set {b, c}", "invalid YAML"),
+        ("a: !degrees (lambda:0)()", "Lambda 'lambda:0' is not allowed"),
+        ("a: !!python/object/apply:os.system ['touch pwned']", "bomb.yaml:1:4: invalid YAML"),
     ],
 )
-def test_yaml_alias_expansion_is_limited(refused_at, hostile, content, reason):
+def test_yaml_runs_no_code_and_its_aliases_are_limited(refused_at, hostile, content, reason):
     (hostile("").parent / "bomb.yaml").write_text(content)
     assert reason in refused_at(link("xacro.load_yaml('bomb.yaml')"))
 

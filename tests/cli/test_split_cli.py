@@ -97,7 +97,7 @@ def test_every_regime_can_be_created(run, argv, options, name, counts):
     assert (len(split.train), len(split.test)) == counts
 
 
-def test_a_hold_out_split_says_what_it_lacks_and_passes_its_audit(run, ok):
+def test_a_hold_out_split_says_what_it_lacks_and_passes_its_audit(ok):
     words = ("split", "new", "--hold-out", "arm=kinova*", "--name", "my/no-kinova")
     words += ("--from", "arm={mico,kinova_gen3} ee={plane,stick}", "--train", "2")
     out = ok(*words)
@@ -109,9 +109,6 @@ def test_a_hold_out_split_says_what_it_lacks_and_passes_its_audit(run, ok):
         "manufacturer"
     ) in lines
     assert lines[-1] == "next: morphgen split audit my/no-kinova.yaml"
-    before = Path("my/no-kinova.yaml").read_bytes()
-    assert run(*words, "--out", "again.yaml")[0] == 0
-    assert Path("again.yaml").read_bytes() == before
     out = ok("split", "audit", "my/no-kinova.yaml", "--strict")
     assert out.endswith("my/no-kinova: passed: 0 error, 0 warning, 0 accepted\n")
 

@@ -23,6 +23,13 @@ def address(process):
     raise AssertionError(process.stderr.read())
 
 
+def stop(viewing, end=signal.SIGTERM):
+    """Stop a viewer by a signal; return its exit code and what it printed as errors."""
+    viewing.send_signal(end)
+    _, errors = viewing.communicate(timeout=60)  # which ends once its workers have ended, too
+    return viewing.returncode, errors
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_viewer_serves_until_a_signal_and_deletes_uploads(tmp_path, monkeypatch, end):
@@ -35,9 +42,7 @@ def test_a_viewer_serves_until_a_signal_and_deletes_uploads(tmp_path, monkeypatc
         client.sent_to()
     (folder,) = tmp_path.glob("morphgen-uploads-*")
     assert [path.name for path in folder.rglob("*.urdf")] == ["a.urdf"]
-    viewing.send_signal(end)
-    _, errors = viewing.communicate(timeout=60)
-    assert (viewing.returncode, errors) == (0, "")
+    assert stop(viewing, end) == (0, "")
     assert list(tmp_path.glob("morphgen-uploads-*")) == []
 
 
@@ -85,9 +90,7 @@ if __name__ == "__main__":
     )
     address(viewing)
     (folder,) = tmp_path.glob("morphgen-uploads-*")
-    viewing.send_signal(signal.SIGTERM)
-    viewing.communicate(timeout=60)  # which ends once its workers have ended, too
-    assert viewing.returncode == 0
+    assert stop(viewing)[0] == 0
     assert not folder.exists()
 
 
@@ -100,8 +103,7 @@ def test_allowed_origins_are_served(tmp_path):
         client.shows("Grammars")
     with pytest.raises(InvalidStatus):
         PlainClient(port, origin="https://other.example.com")
-    viewing.send_signal(signal.SIGTERM)
-    lines = viewing.communicate(timeout=60)[1].splitlines()
+    lines = stop(viewing)[1].splitlines()
     assert [line for line in lines if not re.search(r", \d+ s$", line)] == []  # progress aside
 
 
@@ -114,15 +116,13 @@ def test_ipv6_address_is_served(tmp_path):
     assert where == f"http://[::1]:{port}"
     with PlainClient(port, address="::1", origin=where) as client:
         client.shows("Grammars")
-    viewing.send_signal(signal.SIGTERM)
-    assert viewing.communicate(timeout=60)[1] == ""
+    assert stop(viewing) == (0, "")
 
 
 @pytest.mark.slow
 def test_non_local_host_prints_a_warning(tmp_path):
     viewing = start("view", "--host", "0.0.0.0", "--port", "8932")
     address(viewing)
-    viewing.send_signal(signal.SIGINT)
-    _, errors = viewing.communicate(timeout=60)
+    _, errors = stop(viewing, signal.SIGINT)
     assert "warning: --host 0.0.0.0" in errors
     assert "no password" in errors
