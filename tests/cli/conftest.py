@@ -73,14 +73,9 @@ def urdf(tmp_path):
     return write
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("cache")
-
-
 @pytest.fixture
 def own_cache(cache, monkeypatch):
-    """Keep goal sets in a cache of the module."""
+    """Keep goal sets in the cache of the tests."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
 
 

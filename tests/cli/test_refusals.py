@@ -229,6 +229,9 @@ def test_invalid_arguments_are_refused_in_one_line(refused, refusal):
     assert reason in refused(*shlex.split(ABBREVIATIONS.get(first, first)), *words)
 
 
+COMPOSE = ("compose", "base=gantry", "ee=plane", "--no-picture", "--out", "out")
+
+
 def test_names_are_printed_in_any_encoding(tmp_path):
     (tmp_path / "ü.urdf").write_text('<robot name="r"><link name="ä"/></robot>', encoding="utf-8")
     process = start("show", tmp_path / "ü.urdf", PYTHONIOENCODING="ascii")
@@ -292,26 +295,24 @@ def test_missing_data_package_error_says_how_to_install_it(refused, tmp_path):
     ],
 )
 def test_a_bundle_that_was_edited_is_never_replaced(refused, run, file, why):
-    words = ("compose", "base=gantry", "ee=plane", "--no-picture", "--out", "out")
-    assert run(*words)[0] == 0
+    assert run(*COMPOSE)[0] == 0
     edited = Path("out/gantry-plane") / file
     edited.parent.mkdir(exist_ok=True)
     with edited.open("a") as stream:
         stream.write("<!-- years of work -->")
-    assert f"out/gantry-plane is not replaced: {why}; move the folder away" in refused(*words)
+    assert f"out/gantry-plane is not replaced: {why}; move the folder away" in refused(*COMPOSE)
     assert "years of work" in edited.read_text()
     fitted = ("fit", "base=gantry", "ee=plane", "--no-picture", "--out", "out/gantry-plane")
     assert f"out/gantry-plane is not replaced: {why}" in refused(*fitted)
 
 
 def test_a_bundle_with_exported_files_is_replaced(run):
-    words = ("compose", "base=gantry", "ee=plane", "--no-picture", "--out", "out")
-    assert run(*words)[0] == 0
+    assert run(*COMPOSE)[0] == 0
     for name in FILES:
         (Path("out/gantry-plane") / f"robot.{name}").touch()
     (Path("out/gantry-plane/.DS_Store")).touch()  # of a file manager
     (Path("out/gantry-plane/robot.urdf")).unlink()  # a damaged bundle is mended
-    assert run(*words)[0] == 0
+    assert run(*COMPOSE)[0] == 0
     names = {path.name for path in Path("out/gantry-plane").iterdir()}
     assert names == {"robot.urdf", "robot.xml", "card.json"}
 
