@@ -222,8 +222,7 @@ RECTANGLE |= {"ray_origin": None, "ray_direction": None, "screen_pos": [[0.1, 0.
     ids=lambda message: repr(message)[:50],
 )
 def test_malformed_message_closes_only_its_connection(shared_viewer, quiet, message):
-    on = shared_viewer
-    with PlainClient(on.port) as client, PlainClient(on.port) as other:
+    with PlainClient(shared_viewer.port) as client, PlainClient(shared_viewer.port) as other:
         client.shows("Grammars")
         client.send(message)
         code, reason = client.until_closed()

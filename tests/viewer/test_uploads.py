@@ -251,12 +251,11 @@ def test_uploaded_bundle_keeps_tool_and_home(access, tmp_path, as_zip, pairs):
 
 def test_uploads_come_through_a_websocket_and_are_read(shared_viewer, tmp_path):
     write_bundle(arm(), tmp_path / "arm", picture=False)
-    on = shared_viewer
     content = zip_files("arm", {p.name: p.read_bytes() for p in (tmp_path / "arm").iterdir()})
-    with PlainClient(on.port) as client:
+    with PlainClient(shared_viewer.port) as client:
         client.upload("arm.zip", content)
         query = client.sent_to()
-    with PlainClient(on.port, query) as client:
+    with PlainClient(shared_viewer.port, query) as client:
         client.control("Slider", "shoulder")
         client.until(lambda: "see it" in client.text)
 
@@ -269,13 +268,12 @@ def test_uploads_come_through_a_websocket_and_are_read(shared_viewer, tmp_path):
     ],
 )  # fmt: skip
 def test_hostile_upload_is_rejected_with_a_message(shared_viewer, quiet, name, content, why):
-    on = shared_viewer
-    before = set(on.files.uploads.iterdir())
-    with PlainClient(on.port) as client:
+    before = set(shared_viewer.files.uploads.iterdir())
+    with PlainClient(shared_viewer.port) as client:
         client.upload(name, content)
         client.shows(why)
         assert tempfile.gettempdir() not in client.text
-        assert set(on.files.uploads.iterdir()) == before
+        assert set(shared_viewer.files.uploads.iterdir()) == before
 
 
 def test_upload_that_differs_from_its_announcement_is_dropped(viewer, quiet):
@@ -297,11 +295,10 @@ def test_upload_that_differs_from_its_announcement_is_dropped(viewer, quiet):
 
 def test_errors_show_no_temporary_path(shared_viewer, capfd):
     broken = URDF.replace(b'<link name="a"/>', b'<link name="a"/><link name="b"/>')
-    on = shared_viewer
-    with PlainClient(on.port) as client:
+    with PlainClient(shared_viewer.port) as client:
         client.upload("a.urdf", broken)
         query = client.sent_to()
-    with PlainClient(on.port, query) as client:
+    with PlainClient(shared_viewer.port, query) as client:
         client.shows("upload:")
         client.shows("a.urdf")
         client.shows("tag error")
@@ -314,11 +311,10 @@ def test_names_in_an_upload_are_escaped_on_the_page(shared_viewer):
     <sphere radius="0.1"/></geometry></visual></link><link name="tool"/><joint name="{name}"
     type="revolute"><parent link="{name}"/><child link="tool"/><axis xyz="0 0 1"/>
     <limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
-    on = shared_viewer
-    with PlainClient(on.port) as client:
+    with PlainClient(shared_viewer.port) as client:
         client.upload("a.urdf", text.encode())
         query = client.sent_to()
-    with PlainClient(on.port, query) as client:
+    with PlainClient(shared_viewer.port, query) as client:
         client.change(client.control("Dropdown", "Link"), html.unescape(name))
         client.until(lambda: "inertial-missing" in client.text or "no findings" in client.text
                      or "tag warning" in client.text)  # fmt: skip

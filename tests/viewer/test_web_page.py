@@ -292,8 +292,7 @@ def test_pages_without_a_subject_list_what_there_is(shared_viewer, query, text):
 
 
 def test_compare_without_robots_offers_a_picker(shared_viewer):
-    on = shared_viewer
-    with PlainClient(on.port, "?compare=") as client:
+    with PlainClient(shared_viewer.port, "?compare=") as client:
         client.shows("Compare two to four robots")
         client.change(client.control("Text", "or words"), "arm=ur5 ee=plane")
         client.change(client.control("Button", "Add"))
