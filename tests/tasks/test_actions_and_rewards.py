@@ -1,7 +1,7 @@
 """Tables of robots, names of robots, actions, rewards, checks of tasks, and speed."""
 
 import math
-from contextlib import closing
+import re
 from dataclasses import dataclass, replace
 from importlib import import_module
 from itertools import count
@@ -34,10 +34,11 @@ from morphgen.grammar.library import default_library
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.kinematics_torch import matrix_from_quaternion
 from morphgen.model.robot import Frame, Link, Robot
+from morphgen.model.tree import rename
 from morphgen.rl.config import PPOConfig
 from morphgen.rl.runs.checkpoint import config_from
 from morphgen.tasks.actions import ActionDecoder, JointMotion
-from morphgen.tasks.gym.vector import task_vector
+from morphgen.tasks.gym.vector import TaskVector
 from morphgen.tasks.observation import LinkTokens
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.envs import PushFormulas, curriculum_line, push_terms
@@ -97,43 +98,33 @@ def test_targets_stay_within_limits_and_masked_links_do_not_move(robot_tables):
     body = torch.tensor([1])
     mask = robot_tables.action_mask(fingers=False)[body]
     motion = JointMotion(robot_tables, body)
-    home = robot_tables.home[body]
+    home, upper, moved = robot_tables.home[1], robot_tables.upper[1], robot_tables.moves_tool[1]
     motion.targets.copy_(home)
     motion.act(0.5 * mask)
-    half = torch.minimum(home + robot_tables.max_step[body] / 2, robot_tables.upper[body])
-    moved = robot_tables.moves_tool[1]
-    assert torch.equal(motion.targets, torch.where(moved, half, home))
+    half = torch.minimum(home + robot_tables.max_step[1] / 2, upper)
+    assert torch.equal(motion.targets[0], torch.where(moved, half, home))
     for _ in range(400):
         motion.act(1.0 * mask)
-    assert torch.equal(motion.targets[0, moved], robot_tables.upper[1, moved])
-    assert torch.equal(motion.targets[0, ~moved], home[0, ~moved])
+    assert torch.equal(motion.targets[0], torch.where(moved, upper, home))
 
 
 def test_reach_reward_terms():
     config = ReachConfig()
     distance = torch.tensor([0.029, 0.031])
-    violation = limit_violation(
-        torch.tensor([[1.5, 0.0], [0.0, -2.5]]), torch.tensor([-1.0, -2.0]), torch.tensor([1.0, 2])
-    )
+    q = torch.tensor([[1.5, 0.0], [0.0, -2.5]])
+    violation = limit_violation(q, torch.tensor([-1.0, -2.0]), torch.tensor([1.0, 2]))
     assert violation.tolist() == pytest.approx([0.5, 0.5])
     terms = reach_terms(config, distance, violation, torch.tensor([10.0, 0.0]))
     assert terms["near"].tolist() == [config.near_weight, 0.0]
     assert terms["distance"].tolist() == pytest.approx([-0.029, -0.031])
     assert terms["joint_limits"].tolist() == pytest.approx([-0.5, -0.5])
     assert terms["joint_acceleration"].tolist() == pytest.approx([-1e-4, 0.0])
-    score = anybody_score(config, distance)
-    assert score.tolist() == pytest.approx([200.0, -50 * 0.031**2])
+    assert anybody_score(config, distance).tolist() == pytest.approx([200.0, -50 * 0.031**2])
 
 
 def test_push_reward_terms():
-    success = torch.tensor([True, False])
-    terms = push_terms(
-        PushConfig(),
-        to_go=torch.tensor([0.0, 0.3]),
-        approach=torch.tensor([0.1, 0.2]),
-        limit_violation=torch.zeros(2),
-        success=success,
-    )
+    to_go, approach = torch.tensor([0.0, 0.3]), torch.tensor([0.1, 0.2])
+    terms = push_terms(PushConfig(), to_go, approach, torch.zeros(2), torch.tensor([True, False]))
     assert terms["success"].tolist() == [10.0, 0.0]
     assert terms["distance"].tolist() == pytest.approx([0.0, -0.3])
     assert terms["approach"].tolist() == pytest.approx([-0.05, -0.1])
@@ -155,9 +146,8 @@ def test_curriculum_line_moves_during_the_first_half_of_training():
     line = torch.tensor([0.2, 0.1])
     places = [curriculum_line(PushConfig(), line, p / 100)[0].item() for p in range(101)]
     assert places[0] == pytest.approx(0.02)
-    assert places == sorted(places)
+    assert places[:51] == sorted(set(places))
     assert places[50:] == [pytest.approx(0.2)] * 51
-    assert len(set(places)) == 51
 
 
 FOLDERS = default_library(()).folders
@@ -174,24 +164,13 @@ def robot_tables(robots):
     return build_robot_tables(robots, FOLDERS)
 
 
-def configurations(robots, robot_tables, n=20):
-    """Return each indices (n R,) and joint positions (n R, J) of n configurations per each."""
-    rng = np.random.default_rng(0)
-    body = torch.arange(len(robots)).repeat_interleave(n)
-    q = torch.zeros(len(body), robot_tables.max_joints, dtype=torch.float64)
-    for i, each in enumerate(robots):
-        q[body == i, : each.dof] = torch.from_numpy(random_configurations(each, n, rng))
-    return body, q
-
-
 def test_position_codes_match_the_tokens(robots, robot_tables):
-    body, q = configurations(robots, robot_tables, n=4)
-    link_tokens = LinkTokens(robot_tables, body)(q.float())
+    rng = np.random.default_rng(0)
     for i, each in enumerate(robots):
-        shapes = token_shapes(each, FOLDERS)
-        expected = tokens(each, shapes, q[body == i, : each.dof].numpy())
-        together = link_tokens[body == i]
-        n = len(each.links)
+        q = torch.zeros(4, robot_tables.max_joints)
+        q[:, : each.dof] = torch.from_numpy(random_configurations(each, 4, rng))
+        together, n = LinkTokens(robot_tables, torch.full((4,), i))(q), len(each.links)
+        expected = tokens(each, token_shapes(each, FOLDERS), q[:, : each.dof].numpy())
         # The fastest sine has angular frequency 64 pi, which costs five digits in float32.
         assert together[:, :n].numpy() == pytest.approx(expected, abs=2e-4)
         assert (together[:, n:] == 0).all()
@@ -199,19 +178,17 @@ def test_position_codes_match_the_tokens(robots, robot_tables):
 
 def test_masks_and_step_sizes_match_the_joints(robots, robot_tables):
     for i, each in enumerate(robots):
-        n = len(each.links)
-        assert robot_tables.link_mask[i].tolist() == [True] * n + [False] * (
-            robot_tables.max_links - n
-        )
+        links = torch.arange(robot_tables.max_links)
+        assert torch.equal(robot_tables.link_mask[i], links < len(each.links))
         moved = [k + 1 for k in each.independent_joints]
-        assert torch.nonzero(robot_tables.joint_of_link[i] >= 0)[:, 0].tolist() == moved
+        assert links[robot_tables.joint_of_link[i] >= 0].tolist() == moved
         for j, k in enumerate(each.independent_joints):
             joint = each.joints[k]
             most = STEP_SLIDE if joint.kind == "prismatic" else STEP_TURN
             expected = min(most, (joint.velocity or np.inf) * CONTROL_PERIOD)
             assert robot_tables.max_step[i, j] == pytest.approx(expected)
-            assert robot_tables.lower[i, j] == pytest.approx(joint.effective_limits[0])
-            assert robot_tables.upper[i, j] == pytest.approx(joint.effective_limits[1])
+            limits = (float(robot_tables.lower[i, j]), float(robot_tables.upper[i, j]))
+            assert limits == pytest.approx(joint.effective_limits)
         assert (robot_tables.max_step[i, each.dof :] == 0).all()
 
 
@@ -225,16 +202,12 @@ def test_fingers_are_actuated_in_push_but_not_in_reach(robots, robot_tables):
     assert all("finger" in name for name in fingers)
 
 
-@pytest.mark.parametrize(
-    ("each", "error", "words"),
-    [
-        (Robot("r", (Link("a"),)), RobotError, "tool"),
-        (Robot("r", (Link("a"),), frames=(Frame("tool", "a"),)), RobotError, "no joint moves"),
-    ],
-)
-def test_robots_without_a_tool_or_moving_joint_are_rejected(each, error, words):
-    with pytest.raises(error, match=words):
-        build_robot_tables([each])
+def test_robots_without_a_tool_or_moving_joint_are_rejected():
+    bare = Robot("r", (Link("a"),))
+    with pytest.raises(RobotError, match="tool"):
+        build_robot_tables([bare])
+    with pytest.raises(RobotError, match="no joint moves"):
+        build_robot_tables([replace(bare, frames=(Frame("tool", "a"),))])
     with pytest.raises(BenchmarkError, match="no robots"):
         build_robot_tables([])
 
@@ -309,19 +282,11 @@ def test_in_a_batch_with_another_task_only_reach_has_angles(made):
     step = batch.step(torch.zeros(batch.action_mask.shape))
     assert torch.isfinite(step.angle).tolist() == [True, False, True, False]
     alone = made(POSE, words[:1], n=1)
-    assert torch.equal(
-        alone.step(torch.zeros(1, step.observation["links"].shape[1])).angle, step.angle[:1]
-    )
-
-
-def test_vectors_report_the_angle(tmp_path):
-    options = {"sim": "mujoco", "cache": tmp_path}
-    vector = task_vector(2, task="reach", robot=robot("arm3-stick"), configs=(POSE,), **options)
+    assert torch.equal(alone.step(torch.zeros(alone.action_mask.shape)).angle, step.angle[:1])
+    vector = TaskVector(batch)
     vector.reset(seed=0)
-    infos = vector.step(np.zeros(vector.action_space.shape))[-1]
-    assert infos["angle"].shape == (2,)
-    assert (infos["angle"] > 0).all()
-    vector.close()
+    infos = vector.step(np.zeros(vector.action_space.shape, np.float32))[-1]
+    assert (infos["angle"][::2] > 0).all()
 
 
 EXTRA = ObservationField("extra", 1, GOAL.mask)
@@ -347,18 +312,9 @@ def make(monkeypatch, tmp_path):
 
     def step(fields=(GOAL, EXTRA), made=None, make_envs=True, sample=Reach.sample, **methods):
         envs = type("Envs", (HoverEnvs,), methods)
-        kind = type(
-            "Hover",
-            (Reach,),
-            {
-                "name": "hover",
-                "config_type": HoverConfig,
-                "fields": fields,
-                "sample": sample,
-                "make_envs": lambda self, *args: made or (envs(*args) if make_envs else None),
-            },
-        )
-        TASKS.register(kind())
+        parts = {"name": "hover", "config_type": HoverConfig, "fields": fields, "sample": sample}
+        parts["make_envs"] = lambda self, *args: made or (envs(*args) if make_envs else None)
+        TASKS.register(type("Hover", (Reach,), parts)())
         batch = make_batch("hover", ["gantry-plane"], 2, sim="kinematic", cache=tmp_path)
         batch.reset()
         return batch.step(torch.zeros(batch.action_mask.shape))
@@ -429,18 +385,15 @@ def test_faults_are_named(make, parts, message):
             {"sample": lambda self, robot, config: None},
             r"'hover': sample\(robot, config\): got an unexpected keyword argument 'obstacles'",
         ),
-        (
-            {"make_envs": lambda self: None},
-            r"'hover': make_envs\(\): too many positional arguments",
-        ),
+        ({"make_envs": lambda _: None}, r"'hover': make_envs\(\): too many positional arguments"),
     ],
 )
 def test_an_incomplete_task_is_not_registered(monkeypatch, parts, message):
     monkeypatch.setattr(TASKS, "_loaded", dict(TASKS._loaded))
-    described = {name: getattr(Reach, name) for name in ("goal_set_type", "goal_format", "fields")}
-    methods = {name: getattr(Reach, name) for name in ("sample", "certify", "make_envs")}
-    whole = {"name": "hover", "config_type": HoverConfig, "cache_folder": "hover", **described}
-    parts = {name: part for name, part in {**whole, **methods, **parts}.items() if part}
+    copied = ("goal_set_type", "goal_format", "fields", "sample", "certify", "make_envs")
+    whole = {"name": "hover", "config_type": HoverConfig, "cache_folder": "hover"}
+    whole |= {name: getattr(Reach, name) for name in copied}
+    parts = {name: part for name, part in {**whole, **parts}.items() if part}
     with pytest.raises(TaskError, match=f"task {message}"):
         TASKS.register(type("Hover", (Task,), parts)())
     assert parts["name"] not in TASKS
@@ -480,7 +433,6 @@ def named(tmp_path_factory):
     robot = morphgen.compose(WORDS_ONE_ROBOT)
     primitives = morphgen.compose(WORDS_ONE_ROBOT, name="primitives", geometry="primitive")
     bundle = morphgen.write(robot, folder, picture=False)
-    other = morphgen.write(primitives, folder, picture=False)
     return {
         "words": WORDS_ONE_ROBOT,
         "bundle": bundle,
@@ -488,7 +440,7 @@ def named(tmp_path_factory):
         "robot": robot,
         "read": morphgen.read(bundle),
         "primitives": primitives,
-        "bundle of primitives": other,
+        "bundle of primitives": morphgen.write(primitives, folder, picture=False),
     }
 
 
@@ -496,18 +448,17 @@ def named(tmp_path_factory):
 def batches(named, tmp_path_factory):
     """One environment per name, with freshly sampled goals."""
 
-    def options(name):
-        cache = tmp_path_factory.mktemp(name.replace(" ", "-"))
+    def options():
+        cache = tmp_path_factory.mktemp("goals")
         return {"sim": "mujoco", "seed": 0, "configs": (CONFIG,), "cache": cache}
 
     made = {
-        name: make_batch("reach", [robot], 1, obstacles=True, **options(name))
+        name: make_batch("reach", [robot], 1, obstacles=True, **options())
         for name, robot in named.items()
     }
-    one = split(
-        [member(WORDS_ONE_ROBOT, task="reach", obstacles=True)], [member("prims", task="reach")]
-    )
-    made["member"] = make_split_batch(one, "train", 1, **options("member"))
+    train = member(WORDS_ONE_ROBOT, task="reach", obstacles=True)
+    of_split = split([train], [member("prims", task="reach")])
+    made["member"] = make_split_batch(of_split, "train", 1, **options())
     yield made
     for batch in made.values():
         batch.close()
@@ -515,22 +466,23 @@ def batches(named, tmp_path_factory):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_shapes_goals_and_scores_are_the_same(batches, name):
-    reference, other = (batches[each].specs[0].robot for each in ("words", name))
-    assert [link.collisions for link in other.links] == [
-        link.collisions for link in reference.links
-    ]
-    assert other.joints == reference.joints
-    assert other.home == reference.home
-    assert other.ignore_pairs == reference.ignore_pairs
-    assert robot_hash(other, visuals=False) == robot_hash(reference, visuals=False)
-    assert (batches[name].robot_tables.tokens == batches["words"].robot_tables.tokens).all()
-    reference, other = (batches[each].specs[0].goals for each in ("words", name))
-    assert (other.key, other.tried) == (reference.key, reference.tried)
-    assert other.obstacles == reference.obstacles
-    np.testing.assert_array_equal(other.q, reference.q)
-    np.testing.assert_array_equal(other.poses, reference.poses)
-    rewards, expected = (rewards_of(batches[each]) for each in (name, "words"))
-    assert rewards == expected
+    batch, reference = batches[name], batches["words"]
+    robot, expected = (each.specs[0].robot for each in (batch, reference))
+    assert [link.collisions for link in robot.links] == [link.collisions for link in expected.links]
+    for part in ("joints", "home", "ignore_pairs"):
+        assert getattr(robot, part) == getattr(expected, part)
+    assert robot_hash(robot, visuals=False) == robot_hash(expected, visuals=False)
+    bare = robot.with_links([replace(link, visuals=()) for link in robot.links])
+    assert robot_hash(bare, visuals=False) == robot_hash(robot, visuals=False)
+    assert robot_hash(bare) != robot_hash(robot)
+    assert (batch.robot_tables.tokens == reference.robot_tables.tokens).all()
+    goals, expected = (each.specs[0].goals for each in (batch, reference))
+    for part in ("key", "tried", "obstacles"):
+        assert getattr(goals, part) == getattr(expected, part)
+    np.testing.assert_array_equal(goals.q, expected.q)
+    np.testing.assert_array_equal(goals.poses, expected.poses)
+    rewards = rewards_of(batch)
+    assert rewards == rewards_of(reference)
     assert len(set(rewards)) > STEPS / 2
 
 
@@ -540,13 +492,6 @@ def rewards_of(batch):
     batch.reset(0)
     actions = [batch.action_mask * float(rng.uniform(-1, 1)) for _ in range(STEPS)]
     return [float(batch.step(action).reward[0]) for action in actions]
-
-
-def test_visuals_do_not_change_the_simulation_hash():
-    robot = load_robot("arm=ur5 ee=stick")
-    bare = robot.with_links([replace(link, visuals=()) for link in robot.links])
-    assert robot_hash(bare, visuals=False) == robot_hash(robot, visuals=False)
-    assert robot_hash(bare) != robot_hash(robot)
 
 
 @pytest.mark.parametrize(
@@ -559,9 +504,8 @@ def test_visuals_do_not_change_the_simulation_hash():
     ],
 )
 def test_names_are_compose_arguments(given, words):
-    expected = morphgen.compose(words, geometry="primitive")
-    assert load_robot(given).name == expected.name
-    assert robot_hash(load_robot(given)) == robot_hash(expected)
+    found, expected = load_robot(given), morphgen.compose(words, geometry="primitive")
+    assert (found.name, robot_hash(found)) == (expected.name, robot_hash(expected))
 
 
 def test_collision_shapes_are_primitives_by_default():
@@ -573,13 +517,19 @@ def test_collision_shapes_are_primitives_by_default():
 def test_robot_files_are_read(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = morphgen.write(arm(), "bundles", picture=False)
-    Path("own.urdf").write_text(urdf_text(arm(), str))
-    for given in (folder, str(folder), "bundles/arm", "own.urdf", Path("own.urdf")):
+    Path("lr=3").mkdir()
+    for path in ("own.urdf", "lr=3/own.urdf"):
+        Path(path).write_text(urdf_text(arm(), str))
+    for given in (
+        folder,
+        str(folder),
+        "bundles/arm",
+        "own.urdf",
+        Path("own.urdf"),
+        "lr=3/own.urdf",
+    ):
         assert load_robot(given).dof == arm().dof
         assert load_robot(given).frame("tool")
-    Path("lr=3").mkdir()
-    Path("own.urdf").rename("lr=3/own.urdf")
-    assert load_robot("lr=3/own.urdf").dof == arm().dof
 
 
 def test_folder_that_is_not_a_bundle_does_not_hide_a_grammar(tmp_path, monkeypatch):
@@ -602,9 +552,8 @@ def test_folder_that_is_not_a_bundle_does_not_hide_a_grammar(tmp_path, monkeypat
     ],
 )
 def test_unknown_name_suggests_the_nearest(given, error, says):
-    with pytest.raises(error) as caught:
+    with pytest.raises(error, match=re.escape(says)):
         load_robot(given)
-    assert says in str(caught.value)
 
 
 PANDA = "arm=panda ee=panda_hand"
@@ -618,54 +567,38 @@ def test_unknown_and_unused_geometries_are_refused():
 
 
 def test_convex_robots_collide_as_their_meshes():
-    batches = [
+    simple, convex = (
         make_batch("push", [PANDA], 2, sim="mujoco", geometry=geometry, seed=4)
         for geometry in ("primitive", "convex")
-    ]
-    first, other = (batch.reset() for batch in batches)
+    )
+    first, other = simple.reset(), convex.reset()
     assert all(torch.equal(first[name], other[name]) for name in first)
-    simulated = batches[1].simulation.scenes[0].robot
-    assert batches[1].specs[0].robot.links == batches[0].specs[0].robot.links != simulated.links
+    simulated, body = convex.simulation.scenes[0].robot, simple.specs[0].robot
+    assert convex.specs[0].robot.links == body.links != simulated.links
     meshed = [link for link in simulated.links if has_meshes(link.collisions)]
     assert len(meshed) == 9  # the Panda's meshes are convex, so each is its own piece
-    assert simulated.joints == batches[0].specs[0].robot.joints
+    assert simulated.joints == body.joints
 
 
 def test_convex_pieces_need_the_meshes():
-    composed = robot(PANDA)
-    stranger = replace(composed, provenance={})
-    with pytest.raises(TaskError, match="'convex' needs its meshes"):
-        with_geometry([Scene(stranger)], "convex")
-    changed = replace(composed.joints[0], name="renamed")
-    with pytest.raises(TaskError, match="'convex' needs its meshes"):
-        with_geometry(
-            [Scene(replace(composed, joints=(changed, *composed.joints[1:])))],
-            "convex",
-            default_library().folders,
-        )
-    simple = robot("prims")
+    stranger, simple = replace(robot(PANDA), provenance={}), robot("prims")
+    renamed = rename(robot(PANDA), joints={robot(PANDA).joints[0].name: "renamed"})
+    for body in (stranger, renamed):
+        with pytest.raises(TaskError, match="'convex' needs its meshes"):
+            with_geometry([Scene(body)], "convex", default_library().folders)
     assert with_geometry([Scene(simple)], "convex")[0].robot is simple
 
 
 CONFIG_SPEED = replace(ReachConfig(), num_goals=4, max_episode_steps=10)
 
 
-@pytest.fixture(scope="module")
-def robot_speed():
-    return morphgen.compose("arm=arm3 ee=claw")
-
-
 @pytest.mark.parametrize("sim", [PYBULLET, "mujoco"])
-def test_shares_sum_to_one_and_separate_the_native_step(robot_speed, sim, tmp_path):
+def test_shares_sum_to_one_and_separate_the_native_step(made, sim):
     ticks, (module, step) = count(), SIMULATORS[sim].native_step
-    with closing(
-        make_batch("reach", [robot_speed], 3, sim=sim, configs=(CONFIG_SPEED,), cache=tmp_path)
-    ) as batch:
-        report = measure_speed(
-            batch, 2000, own=[(import_module(module), step)], clock=lambda: float(next(ticks))
-        )
-        assert "step" not in vars(batch.simulation)
-        assert "observe" not in vars(batch)
+    batch, own = made(CONFIG_SPEED, ["arm3-claw"], 3, sim=sim), [(import_module(module), step)]
+    report = measure_speed(batch, 2000, own=own, clock=lambda: float(next(ticks)))
+    assert "step" not in vars(batch.simulation)
+    assert "observe" not in vars(batch)
     assert sum(report.shares.values()) == pytest.approx(1)
     for part in ("simulator", "around the simulator", "observation", "rewards", "new episodes"):
         assert report.shares[part] > 0, part
@@ -674,12 +607,9 @@ def test_shares_sum_to_one_and_separate_the_native_step(robot_speed, sim, tmp_pa
     assert report.substeps_per_second == 4 * report.steps_per_second > 0
 
 
-def test_simulator_time_is_one_share_without_the_native_step(robot_speed, tmp_path):
-    ticks = count()
-    with closing(
-        make_batch("reach", [robot_speed], 2, sim="mujoco", configs=(CONFIG_SPEED,), cache=tmp_path)
-    ) as batch:
-        report = measure_speed(batch, 507, clock=lambda: float(next(ticks)))
-        assert batch.episode_step.tolist() == [0, 0]  # whole episodes
+def test_simulator_time_is_one_share_without_the_native_step(made):
+    ticks, batch = count(), made(CONFIG_SPEED, ["arm3-claw"], 2)
+    report = measure_speed(batch, 507, clock=lambda: float(next(ticks)))
+    assert batch.episode_step.tolist() == [0, 0]  # whole episodes
     assert "around the simulator" not in report.shares
     assert report.shares["simulator"] == pytest.approx(report.shares["actions"], rel=0.05)

@@ -11,7 +11,7 @@ import torch
 from helpers.faulty_robots import with_joint
 from helpers.goal_sets import draw_spec
 from helpers.joint_targets import SECOND, full_speed, random_walk, smooth_walk
-from helpers.resets import reset_envs
+from helpers.resets import put_home, reset_envs
 from helpers.robots import arm, finger
 from helpers.scenes import PAPER_ROBOTS, push_scene, reach_scene, robot
 from morphgen.errors import SimulationError, TaskError
@@ -38,15 +38,9 @@ NEAR = 0.01
 """Largest distance of tools from MuJoCo's [m]."""
 
 
-def reset(sim, q, envs=None):
-    """Put environments at rest, by default all of them."""
-    reset_envs(sim, range(len(sim.scenes)) if envs is None else envs, torch.as_tensor(q))
-
-
 def follow(sim, targets):
     """Return the positions after every step from home in simulations of one robot, (T, dof)."""
-    home = sim.scenes[0].robot.home
-    reset(sim, [list(home)])
+    put_home(sim)
     path = []
     for target in torch.from_numpy(targets).float():
         sim.step(target[None])
@@ -126,8 +120,7 @@ def test_steady_motion_lags_by_the_law():
     body = finger(2.0)
     speed = 0.5 * np.array([speed_limit(body.joints[k]) for k in body.independent_joints])
     targets = np.array(body.home) + np.outer(np.arange(1, 41), speed * CONTROL_PERIOD)
-    sim = KinematicSimulation([Scene(body)])
-    path = follow(sim, targets)
+    path = follow(KinematicSimulation([Scene(body)]), targets)
     lag = (targets[-1] - path[-1]) / speed
     assert (lag > 0).all()
     assert (lag + CONTROL_PERIOD < LAG * 1.01).all()
@@ -139,14 +132,14 @@ def test_joints_stay_within_their_limits(words):
     body = robot(words)
     lower, upper = joint_limits(body).T
     sim = KinematicSimulation([Scene(body)] * 8)
-    rng = np.random.default_rng(0)
-    reset(sim, rng.uniform(lower, upper, (8, body.dof)))
-    lowest, highest = sim.q.clone(), sim.q.clone()
+    rng, path = np.random.default_rng(0), []
+    reset_envs(sim, range(8), torch.from_numpy(rng.uniform(lower, upper, (8, body.dof))))
     for step in range(300):
         if step % 15 == 0:  # far beyond the limits
             targets = torch.from_numpy(rng.choice([-10.0, 10.0], (8, body.dof))).float()
         sim.step(targets)
-        lowest, highest = torch.minimum(lowest, sim.q), torch.maximum(highest, sim.q)
+        path.append(sim.q.clone())
+    lowest, highest = (torch.stack(path).amin(dim=0), torch.stack(path).amax(dim=0))
     bounded = [not body.joints[k].is_continuous for k in body.independent_joints]
     assert (lowest.numpy() >= lower - 1e-6)[:, bounded].all()
     assert (highest.numpy() <= upper + 1e-6)[:, bounded].all()
@@ -177,7 +170,7 @@ def test_scenes_with_something_to_touch_are_refused(scene, thing):
     KinematicSimulation([reach_scene()], NO_CONTACTS)
 
 
-CONFIG = replace(ReachConfig(), num_goals=20)
+CONFIG = ReachConfig(num_goals=20)
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 
 
@@ -191,21 +184,17 @@ def make_kinematic(specs, num_envs, **options):
 
 
 def rollout(batch, steps=40):
-    """Return all numbers of steps with random actions of each environment, as bytes."""
+    """Return all numbers of steps with random actions of each environment."""
     n, L = batch.action_mask.shape
     with closing(batch):
         batch.reset()
         actions = 2 * torch.rand(steps, L, generator=torch.Generator().manual_seed(0)) - 1
         results = [batch.step(action.expand(n, L).to(batch.device)) for action in actions]
-    keys = sorted(results[0].observation)
-    rows = [
-        torch.cat(
-            [step.reward[:, None], step.q, step.distance[:, None]]
-            + [step.observation[key].float().reshape(n, -1) for key in keys],
-            dim=1,
-        )
-        for step in results
-    ]
+    rows = []
+    for step in results:
+        seen = [step.observation[key] for key in sorted(step.observation)]
+        numbers = (step.reward, step.q, step.distance, *seen)
+        rows.append(torch.cat([each.float().reshape(n, -1) for each in numbers], dim=1))
     return torch.stack(rows).cpu().numpy()
 
 
@@ -225,22 +214,15 @@ def test_kinematic_is_a_registered_simulator_that_mujoco_judges():
         assert evaluation_simulator(name) == name
 
 
-def test_batches_with_something_to_touch_are_refused(tmp_path):
-    body = robot("prims")
-    configs = (replace(PushConfig(), num_goals=2), replace(ReachConfig(), num_goals=2))
-    for task, obstacles, thing in (("push", False, "an object"), ("reach", True, "obstacles")):
-        with pytest.raises(
-            TaskError, match=f"{task} of .* has {thing}; expected simulator .*mujoco"
-        ):
-            make_batch(
-                task,
-                [body],
-                1,
-                obstacles=obstacles,
-                sim="kinematic",
-                configs=configs,
-                cache=tmp_path,
-            )
+@pytest.mark.parametrize(
+    ("task", "obstacles", "thing"),
+    [("push", False, "an object"), ("reach", True, "obstacles")],
+)
+def test_batches_with_something_to_touch_are_refused(cache, task, obstacles, thing):
+    configs = (PushConfig(num_goals=2), ReachConfig(num_goals=2))
+    options = {"obstacles": obstacles, "sim": "kinematic", "configs": configs, "cache": cache}
+    with pytest.raises(TaskError, match=f"{task} of .* has {thing}; expected simulator .*mujoco"):
+        make_batch(task, [robot("prims")], 1, **options)
 
 
 def test_invalid_batch_options_are_rejected(specs):
@@ -258,9 +240,8 @@ def test_devices_of_batches(specs, monkeypatch):
             make_kinematic(specs, 3, device="cuda")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    with pytest.raises(
-        TaskError, match="device 'cuda'; expected device cpu, or simulator warp or k"
-    ):
+    message = "device 'cuda'; expected device cpu, or simulator warp or k"
+    with pytest.raises(TaskError, match=message):
         batch_from_specs(specs, 3, sim="mujoco", device="cuda")
 
 

@@ -23,7 +23,7 @@ from morphgen.tasks.render.renderer import (
     write_video,
 )
 from morphgen.tasks.scenes.env_specs import load_robot
-from morphgen.tasks.scenes.make import make_batch
+from morphgen.tasks.scenes.make import batch_from_specs
 from morphgen.tasks.sim.articulated import ObjectJoints
 from morphgen.tasks.sim.base import Block, Scene
 
@@ -33,13 +33,12 @@ SIZE = (160, 120)
 @pytest.fixture(scope="module")
 def reach(cache):
     config = ReachConfig(num_goals=10)
-    return draw_spec(load_robot("arm3-stick"), config, obstacles=True, seed=0, cache=cache)
+    return draw_spec(load_robot("arm3-stick"), config, obstacles=True, cache=cache)
 
 
 @pytest.fixture(scope="module")
 def push(cache):
-    config = PushConfig(num_goals=10)
-    return draw_spec(load_robot("prims"), config, obstacles=False, seed=0, cache=cache)
+    return draw_spec(load_robot("prims"), PushConfig(num_goals=10), cache=cache)
 
 
 @pytest.fixture
@@ -70,8 +69,7 @@ def test_frames_have_the_requested_size_and_are_reproducible(on, reach):
     frame = drawing.frame(at_goal(reach, 1))
     assert (frame.shape, frame.dtype) == ((SIZE[1], SIZE[0], 3), np.uint8)
     drawing.frame(RenderState(reach.goals.q[5]))
-    again = [drawing.frame(at_goal(reach, 1))]
-    again.append(on(reach).frame(at_goal(reach, 1)))
+    again = [each.frame(at_goal(reach, 1)) for each in (drawing, on(reach))]
     on(reach, (100, 80)).close()  # another renderer disturbs nothing
     again.append(drawing.frame(at_goal(reach, 1)))
     assert all(np.array_equal(frame, each) for each in again)
@@ -91,15 +89,13 @@ def test_goal_is_green_and_drawn_only_on_request(on, reach):
 def test_block_and_ground_line_are_drawn_at_their_positions(on, push):
     drawing = on(push)
     start, line, q = push.goals.blocks[0], push.goals.line, push.goals.q[0]
-    x = push.goals.blocks[:, 0]
-    markers = {"line": ((x.min() + x.max()) / 2, line, 0.0, 1.0, 0.0, 0.0, 0.0)}
-    here = drawing.frame(RenderState(q, start, markers))
     aside = start.copy()
     aside[1] = line
-    there = drawing.frame(RenderState(q, aside, markers))
+    x = push.goals.blocks[:, 0]
+    markers = {"line": ((x.min() + x.max()) / 2, line, 0.0, 1.0, 0.0, 0.0, 0.0)}
+    here, there = (drawing.frame(RenderState(q, block, markers)) for block in (start, aside))
     assert changed(here, there).sum() > 30
-    no_line = drawing.frame(RenderState(q, start))
-    strip = changed(here, no_line)
+    strip = changed(here, drawing.frame(RenderState(q, start)))
     assert 20 < strip.sum() < 1500
     assert here[strip].mean(axis=0).argmax() == 1
 
@@ -126,25 +122,22 @@ def test_camera_frames_the_whole_scene(name, request):
     forward = np.cos(elevation) * flat + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
-    up = np.cross(right, forward)
     seen = points - (camera.lookat - camera.distance * forward)
     depth = seen @ forward
-    half = np.tan(np.radians(renderer.FRONT_FOV / 2))
-    vertical = seen @ up / depth / half
-    across = seen @ right / depth / (half * 4 / 3)
+    half = np.tan(np.radians(renderer.FRONT_FOV / 2)) * depth
     assert depth.min() > 0
+    vertical, across = seen @ np.cross(right, forward) / half, seen @ right / half / (4 / 3)
     most = max(np.abs(vertical).max(), np.abs(across).max())
     assert most == pytest.approx(renderer._MARGIN, abs=1e-6)
 
 
 def test_robot_without_visuals_is_drawn_with_its_collision_shapes(plain):
-    robot = arm()
-    bare = replace(robot, links=tuple(replace(link, visuals=()) for link in robot.links))
+    bare = replace(arm(), links=tuple(replace(link, visuals=()) for link in arm().links))
     block = Block((0.2, 0.2, 0.2), Pose((0.2, -0.5, 0.1)), 0.1)
-    still = plain(Scene(bare, object=block, ground=None))
-    a, b = (still.frame(RenderState(q)) for q in (robot.home, (-1.0, -0.5, 0.0, 0.0)))
+    still, home = plain(Scene(bare, object=block, ground=None)), arm().home
+    a, b = (still.frame(RenderState(q)) for q in (home, (-1.0, -0.5, 0.0, 0.0)))
     assert changed(a, b).sum() > 50
-    with_block = still.frame(RenderState(robot.home, (0.2, -0.5, 0.1, 1.0, 0.0, 0.0, 0.0)))
+    with_block = still.frame(RenderState(home, (0.2, -0.5, 0.1, 1.0, 0.0, 0.0, 0.0)))
     assert changed(a, with_block).sum() > 50
 
 
@@ -165,15 +158,8 @@ def test_closed_renderer_raises_a_clear_error(on, reach):
         drawing.frame(RenderState(reach.goals.q[0]))
 
 
-def test_snapshot_is_one_environment_of_a_batch(cache):
-    batch = make_batch(
-        ["reach", "push"],
-        ["arm3-stick", "prims"],
-        2,
-        sim="mujoco",
-        configs=(ReachConfig(num_goals=10), PushConfig(num_goals=10)),
-        cache=cache,
-    )
+def test_snapshot_is_one_environment_of_a_batch(reach, push):
+    batch = batch_from_specs([reach, push], 2, sim="mujoco")
     batch.reset()
     reaching, pushing = render_state(batch, 0), render_state(batch, 1)
     assert reaching.block is None

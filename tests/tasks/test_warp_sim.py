@@ -47,10 +47,8 @@ def walks(scenes, joints, seed=0):
 @pytest.fixture(scope="module")
 def arms():
     """Three robots of one structure with other numbers."""
-    return [
-        Scene(robot(f"arm=arm3 arm.length={length} ee=stick"), ground=None)
-        for length in (0.25, 0.3, 0.35)
-    ]
+    names = (f"arm=arm3 arm.length={length} ee=stick" for length in (0.25, 0.3, 0.35))
+    return [Scene(robot(name), ground=None) for name in names]
 
 
 @pytest.fixture(scope="module")
@@ -112,20 +110,14 @@ def test_robots_of_one_structure_share_a_model_and_move_as_if_they_were_alone(
 
 
 def test_structures_differ_where_the_library_has_one_value_for_all_worlds():
-    """Other joints and types of shapes make another structure."""
-    base = robot("arm=arm3 ee=stick")
-    names = ("arm=arm5 ee=stick", "arm=arm3 ee=plane")
-    scenes = [Scene(base), *(Scene(robot(words)) for words in names), Scene(base)]
+    """Other joints and types of shapes, or none, make another structure."""
+    base, *others = (
+        robot(f"arm={words}") for words in ("arm3 ee=stick", "arm5 ee=stick", "arm3 ee=plane")
+    )
+    bare = replace(base, links=tuple(replace(link, collisions=()) for link in base.links))
+    scenes = [Scene(each, ground=None) for each in (base, *others, base, bare)]
     groups = structures(scenes, worlds(scenes, Contacts()))
-    assert [each.envs.tolist() for each in groups] == [[0, 3], [1], [2]]
-
-
-def test_a_robot_without_collision_shapes_is_a_structure_of_its_own():
-    arm = robot("arm=arm3 ee=stick")
-    bare = replace(arm, links=tuple(replace(link, collisions=()) for link in arm.links))
-    scenes = [Scene(each, ground=None) for each in (bare, arm)]
-    groups = structures(scenes, worlds(scenes, Contacts()))
-    assert [each.envs.tolist() for each in groups] == [[0], [1]]
+    assert [each.envs.tolist() for each in groups] == [[0, 3], [1], [2], [4]]
 
 
 @pytest.mark.slow
@@ -241,10 +233,8 @@ def table(height):
 def test_static_shapes_are_where_each_robot_of_a_structure_has_them():
     """Blocks come to rest on the tops of tables of different heights."""
     heights = (0.2, 0.6, 0.4)
-    scenes = [
-        Scene(table(height), object=Block((0.1,) * 3, Pose((0.0, 0.0, height + 0.1)), 0.1))
-        for height in heights
-    ]
+    blocks = [Block((0.1,) * 3, Pose((0.0, 0.0, height + 0.1)), 0.1) for height in heights]
+    scenes = [Scene(table(h), object=block) for h, block in zip(heights, blocks, strict=True)]
     assert len(structures(scenes, worlds(scenes, Contacts()))) == 1
     sim = simulation(scenes)
     for _ in range(SECOND // 2):
@@ -300,16 +290,10 @@ def test_kernels_of_another_gpu_do_not_count_as_compiled(tmp_path, monkeypatch):
 @pytest.mark.parametrize("task", [pytest.param("reach", marks=pytest.mark.slow), "push"])
 def test_a_batch_has_the_episodes_and_nearly_the_steps_of_mujoco(task):
     """The same seed gives the same starts and goals, and the same actions the same rewards."""
-    robots = ["arm=ur5 ee=stick", "arm=xarm7 ee=stick"]
-    mujoco = make_batch(task, robots, 4, sim="mujoco", seed=3)
-    scenes = [mujoco.specs[i].scene for i in mujoco.env_robot_index.tolist()]
-    ours = TaskBatch(
-        mujoco.robot_tables,
-        mujoco.specs,
-        mujoco.env_robot_index.tolist(),
-        simulation(scenes),
-        seed=3,
-    )
+    mujoco = make_batch(task, ["arm=ur5 ee=stick", "arm=xarm7 ee=stick"], 4, sim="mujoco", seed=3)
+    index = mujoco.env_robot_index.tolist()
+    sim = simulation([mujoco.specs[i].scene for i in index])
+    ours = TaskBatch(mujoco.robot_tables, mujoco.specs, index, sim, seed=3)
     first, other = ours.reset(), mujoco.reset()
     assert all(torch.equal(first[name], other[name]) for name in first)
     actions = torch.zeros(4, mujoco.robot_tables.max_links)
