@@ -1,7 +1,5 @@
 """Search for primitives: enclosing ones, spheres, their quality."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import os
@@ -17,30 +15,17 @@ from scipy.spatial.transform import Rotation
 
 from helpers.robots import arm
 from morphgen.errors import FitError, FormatError
-from morphgen.fitting.canonical import KINDS, Kind
+from morphgen.fitting import search
+from morphgen.fitting.canonical import KINDS
 from morphgen.fitting.link_fit import FitOptions, enclose, fit_shapes
-from morphgen.fitting.quality import Quality, quality, signed_distance
+from morphgen.fitting.quality import quality, signed_distance
 from morphgen.fitting.replace_collision import as_spheres, has_only_spheres, link_spheres
-from morphgen.fitting.search import (
-    DIGITS,
-    MIN_POINTS,
-    Candidates,
-    Cloud,
-    Round,
-    ascend,
-    best_several,
-    best_single,
-    best_spheres,
-    by_growth,
-    by_pieces,
-    covered,
-    sample_solid,
-)
-from morphgen.fitting.solid import Solid, solid_of, solid_of_mesh
+from morphgen.fitting.solid import solid_of, solid_of_mesh
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import (
+    IDENTITY,
     Box,
     Capsule,
     Cylinder,
@@ -52,7 +37,6 @@ from morphgen.model.geometry import (
     volume,
 )
 from morphgen.model.inertia import solid_mesh
-from morphgen.typing import Array
 
 TILTED = Pose.from_xyz_rpy((0.1, -0.2, 0.3), (0.4, 0.7, -1.1))
 PRIMITIVES = (Box((0.1, 0.2, 0.4)), Cylinder(0.06, 0.3), Sphere(0.1))
@@ -63,13 +47,13 @@ ANGLE = (
 
 
 def target_of(*shapes, seed=0):
-    return sample_solid(solid_of(shapes), seed)
+    return search.sample_solid(solid_of(shapes), seed)
 
 
 def fitted(geometry, pose=TILTED, seed=0):
     """Return the best single primitive of a primitive, its score, and the solid."""
     target = target_of(Shape(geometry, pose), seed=seed)
-    fit = best_single(target)
+    fit = search.best_single(target)
     (shape,), score = fit.shapes, fit.iou
     return shape, score, target.solid
 
@@ -81,7 +65,7 @@ def assert_well_formed(shape):
     assert min(sizes) > 0
     for value in (*sizes, *pose.position):
         assert type(value) is float
-        assert round(value, DIGITS) == value
+        assert round(value, search.DIGITS) == value
     assert np.linalg.norm(pose.quaternion) == pytest.approx(1.0, abs=1e-12)
     assert pose.quaternion[0] >= 0
     assert shape.rgba is None
@@ -126,8 +110,8 @@ def test_a_thin_plate_is_recovered(seed):
 
 def test_an_l_shape_is_fitted_by_two_boxes():
     target = target_of(*ANGLE)
-    one = best_single(target)
-    two = best_several(target, one, 0)
+    one = search.best_single(target)
+    two = search.best_several(target, one, 0)
     shapes = two.shapes
     assert len(shapes) == 2
     for shape in shapes:
@@ -169,7 +153,7 @@ def test_the_same_seed_gives_the_same_shapes_with_any_number_of_threads():
 def test_a_solid_that_fills_almost_none_of_its_bounds_is_an_error():
     frame = [trimesh.creation.box(np.roll((1.0, 0.001, 0.001), i)) for i in range(3)]
     with pytest.raises(FitError, match="too thin") as caught:
-        sample_solid(solid_of_mesh(trimesh.util.concatenate(frame)), 0)
+        search.sample_solid(solid_of_mesh(trimesh.util.concatenate(frame)), 0)
     assert "%" in str(caught.value)
     assert "\n" not in str(caught.value)
     with pytest.raises(FitError, match="too thin"):
@@ -178,54 +162,45 @@ def test_a_solid_that_fills_almost_none_of_its_bounds_is_an_error():
 
 def test_too_few_points_give_no_further_guess():
     target = target_of(Shape(Box((0.1, 0.2, 0.3))))
-    few = replace(target, inside=target.inside & (np.cumsum(target.inside) < MIN_POINTS))
-    assert by_pieces(few, 4, [0, 1, 2]) is None
-    one = best_single(target)
-    assert best_several(few, one, 0) is None
-    some = target.take(target.inside & covered(one.candidate, target.points)[0])
-    assert by_growth(one.candidate, some, 0) is None
+    few = replace(target, inside=target.inside & (np.cumsum(target.inside) < search.MIN_POINTS))
+    assert search.by_pieces(few, 4, [0, 1, 2]) is None
+    one = search.best_single(target)
+    assert search.best_several(few, one, 0) is None
+    some = target.take(target.inside & search.covered(one.candidate, target.points)[0])
+    assert search.by_growth(one.candidate, some, 0) is None
 
 
 @pytest.mark.parametrize("kind", range(len(KINDS)))
 def test_a_point_at_the_centre_has_finite_gradients(kind):
     points = np.vstack([np.zeros((1, 3)), np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3))])
-    cloud = Cloud(points, (np.abs(points) < 0.2).all(axis=1), np.ones(len(points)))
+    cloud = search.Cloud(points, (np.abs(points) < 0.2).all(axis=1), np.ones(len(points)))
     arrays = (np.array(each)[None, None] for each in ((0.0,) * 3, (1.0, 0, 0, 0), (0.3, 0.2, 0.1)))
-    start = Candidates(np.array([[kind]]), *arrays)
-    moved = ascend(start, cloud, Round(None, 501, 5, (0.03, 0.002), (0.01, 0.0005)))
+    start = search.Candidates(np.array([[kind]]), *arrays)
+    moved = search.ascend(start, cloud, search.Round(None, 501, 5, (0.03, 0.002), (0.01, 0.0005)))
     assert np.isfinite([*moved.centres[0, 0], *moved.quaternions[0, 0]]).all()
     assert (moved.halves > 0).all()
 
 
-GEOMETRY: dict[Kind, type] = {"box": Box, "cylinder": Cylinder, "sphere": Sphere}
+GEOMETRY = {"box": Box, "cylinder": Cylinder, "sphere": Sphere}
 CUBE = np.array(list(itertools.product((0.0, 0.1), repeat=3)))
 ROUNDING = 1.001
 
 
-def outside(shape: Shape, points: Array) -> float:
+def outside(shape, points):
     """Return the largest signed distance of points to a shape [m]."""
     return float(signed_distance([shape], points).max())
 
 
-def size(shape: Shape) -> float:
-    assert isinstance(shape.geometry, (Box, Cylinder, Sphere))
-    return volume(shape.geometry)
-
-
-def surface(kind: Kind, rng: np.random.Generator) -> tuple[Array, float]:
+def surface(kind, rng):
     """Points of a randomly placed primitive of random size, and its volume."""
-    a, b, c = np.exp(rng.uniform(-3, -0.5, 3))
-    if kind == "box":
-        mesh, truth = trimesh.creation.box((a, b, c)).subdivide(), a * b * c
-    elif kind == "cylinder":
-        mesh, truth = trimesh.creation.cylinder(a, b, sections=60), math.pi * a**2 * b
-    else:
-        mesh, truth = trimesh.creation.icosphere(2, a), 4 / 3 * math.pi * a**3
+    a, b, c = np.exp(rng.uniform(-3, -0.5, 3)).tolist()
+    geometry = {"box": Box((a, b, c)), "cylinder": Cylinder(a, b), "sphere": Sphere(a)}[kind]
     turn = Rotation.from_rotvec(rng.uniform(-3, 3, 3)).as_matrix()
-    return mesh.vertices @ turn.T + rng.uniform(-1, 1, 3), truth
+    points = solid_mesh(geometry).subdivide().vertices @ turn.T + rng.uniform(-1, 1, 3)
+    return points, volume(geometry)
 
 
-def cloud(rng: np.random.Generator, n: int = 40) -> Array:
+def cloud(rng, n=40):
     stretched = rng.normal(size=(n, 3)) * np.exp(rng.uniform(-3, 0, 3))
     turn = Rotation.from_rotvec(rng.uniform(-3, 3, 3)).as_matrix()
     return np.asarray(stretched @ turn.T + rng.uniform(-2, 2, 3))
@@ -233,40 +208,37 @@ def cloud(rng: np.random.Generator, n: int = 40) -> Array:
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_turned_primitive_is_recovered(kind: Kind, seed: int) -> None:
+def test_a_turned_primitive_is_recovered(kind, seed):
     points, truth = surface(kind, np.random.default_rng(seed))
     shape = enclose(points)
     assert isinstance(shape.geometry, GEOMETRY[kind])
-    assert size(shape) == pytest.approx(truth, rel=5e-3)
+    assert volume(shape.geometry) == pytest.approx(truth, rel=5e-3)
     assert outside(shape, points) <= 1e-9
 
 
-def test_a_primitive_aligned_with_the_link_axes_stays_aligned() -> None:
+def test_a_primitive_aligned_with_the_link_axes_stays_aligned():
     centre = np.array([0.5, 0.0, -0.2])
-    box = enclose(np.asarray(trimesh.creation.box((0.1, 0.2, 0.3)).vertices) + centre)
-    assert box.geometry == Box((0.1, 0.2, 0.3))
-    assert box.T_link_shape.position == (0.5, 0.0, -0.2)
-    assert box.T_link_shape.quaternion == (1.0, 0.0, 0.0, 0.0)
+    fit = enclose(np.asarray(trimesh.creation.box((0.1, 0.2, 0.3)).vertices) + centre)
+    assert fit == box((0.1, 0.2, 0.3), at(0.5, 0.0, -0.2))
     points = np.asarray(trimesh.creation.box((0.1, 0.2, 0.3)).subdivide().vertices)
     noise = np.random.default_rng(0).uniform(-1e-7, 1e-7, points.shape)
     assert enclose(points + noise).T_link_shape.quaternion == (1.0, 0.0, 0.0, 0.0)
 
     upright = np.asarray(trimesh.creation.cylinder(0.1, 0.5).vertices)
     cylinder = enclose(upright + centre)
-    assert cylinder.geometry == Cylinder(0.1, 0.5)
-    assert cylinder.T_link_shape == box.T_link_shape
+    assert cylinder == Shape(Cylinder(0.1, 0.5), fit.T_link_shape)
     half = math.sqrt(0.5)
     lying = enclose(upright[:, [2, 0, 1]] + centre)
     assert lying.geometry == Cylinder(0.1, 0.5)
     assert lying.T_link_shape.quaternion == pytest.approx((half, 0.0, half, 0.0))
 
     sphere = enclose(np.asarray(trimesh.creation.icosphere(2, 0.1).vertices) + centre)
-    assert sphere == Shape(Sphere(0.1), box.T_link_shape)
+    assert sphere == Shape(Sphere(0.1), fit.T_link_shape)
 
 
 @pytest.mark.parametrize(("seed", "scale"), [(0, 1.0), (3, 1e-4)])
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_encloses_all_points_after_rounding(kind: Kind, seed: int, scale: float) -> None:
+def test_every_kind_encloses_all_points_after_rounding(kind, seed, scale):
     points = scale * cloud(np.random.default_rng(seed))
     shape = enclose(points, [kind])
     assert isinstance(shape.geometry, GEOMETRY[kind])
@@ -280,33 +252,30 @@ def test_every_kind_encloses_all_points_after_rounding(kind: Kind, seed: int, sc
     assert pose.quaternion[0] >= 0
 
 
-def test_enclosures_of_links_are_not_larger_than_those_of_trimesh() -> None:
+def test_enclosures_of_links_are_not_larger_than_those_of_trimesh():
     arm = load_part(default_library(()).manifest("panda")).fragment
     for name in ("panda_link3", "panda_link4"):  # whose trimesh cylinder is a sixth too large
         mesh = solid_of(arm.link(name).collisions).mesh
         _, extents = trimesh.bounds.oriented_bounds(mesh)
         cylinder = trimesh.bounds.minimum_cylinder(mesh)
         _, radius = trimesh.nsphere.minimum_nsphere(mesh)
-        tightest = min(
-            volume(Box(tuple(extents))),
-            volume(Cylinder(cylinder["radius"], cylinder["height"])),
-            volume(Sphere(radius)),
-        )
+        rivals = (Box(tuple(extents)), Cylinder(cylinder["radius"], cylinder["height"]))
+        tightest = min(map(volume, (*rivals, Sphere(radius))))
         shape = enclose(mesh.vertices)
-        assert size(shape) <= tightest * ROUNDING
+        assert volume(shape.geometry) <= tightest * ROUNDING
         assert outside(shape, np.asarray(mesh.vertices)) <= 1e-9
 
 
-def test_the_smallest_box_of_a_regular_tetrahedron_is_a_cube() -> None:
+def test_the_smallest_box_of_a_regular_tetrahedron_is_a_cube():
     corners = CUBE[[0, 3, 5, 6]]
     turn = Rotation.from_rotvec([0.3, 1.1, -0.4]).as_matrix()
-    assert size(enclose(corners @ turn.T, ["box"])) == pytest.approx(1e-3, rel=1e-3)
+    box = enclose(corners @ turn.T, ["box"]).geometry
+    assert volume(box) == pytest.approx(1e-3, rel=1e-3)
     sphere = enclose(corners @ turn.T, ["sphere"]).geometry
-    assert isinstance(sphere, Sphere)
     assert sphere.radius == pytest.approx(0.05 * math.sqrt(3), abs=2e-6)
 
 
-def smallest_sphere(points: Array) -> float:
+def smallest_sphere(points):
     """Return the radius by enumerating all spheres through two to four points."""
     radii = []
     for n in (2, 3, 4):
@@ -319,7 +288,7 @@ def smallest_sphere(points: Array) -> float:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_the_sphere_is_the_minimum_enclosing_sphere(seed: int) -> None:
+def test_the_sphere_is_the_minimum_enclosing_sphere(seed):
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(8, 3))
     if seed % 3 == 1:
@@ -327,19 +296,18 @@ def test_the_sphere_is_the_minimum_enclosing_sphere(seed: int) -> None:
     if seed % 3 == 2:
         points /= np.linalg.norm(points, axis=1, keepdims=True)
     sphere = enclose(points, ["sphere"]).geometry
-    assert isinstance(sphere, Sphere)
     assert sphere.radius == pytest.approx(smallest_sphere(points), abs=3e-6)
 
 
-def test_the_smallest_of_several_kinds_is_returned() -> None:
+def test_the_smallest_of_several_kinds_is_returned():
     points = cloud(np.random.default_rng(7))
     alone = {kind: enclose(points, [kind]) for kind in KINDS}
-    assert enclose(points) == min(alone.values(), key=size)
-    rest = ("sphere", "box")
-    assert enclose(points, rest) == min((alone[kind] for kind in rest), key=size)
+    for kinds in (KINDS, ("sphere", "box")):
+        smallest = min((alone[kind] for kind in kinds), key=lambda s: volume(s.geometry))
+        assert enclose(points, kinds) == smallest
 
 
-def test_the_result_is_deterministic_and_independent_of_interior_points() -> None:
+def test_the_result_is_deterministic_and_independent_of_interior_points():
     rng = np.random.default_rng(8)
     points = cloud(rng)
     shape = enclose(points)
@@ -348,13 +316,13 @@ def test_the_result_is_deterministic_and_independent_of_interior_points() -> Non
     assert enclose(np.concatenate([points, inner, points])) == shape
 
 
-def test_a_dense_round_hull_is_enclosed_tightly() -> None:
+def test_a_dense_round_hull_is_enclosed_tightly():
     egg = np.asarray(trimesh.creation.icosphere(5).vertices) * (0.3, 0.2, 0.1)
     assert len(egg) > 10_000
     turn = Rotation.from_rotvec([0.5, 0.2, 1.0]).as_matrix()
     shape = enclose(egg @ turn.T, ["box"])
     assert outside(shape, egg @ turn.T) <= 1e-9
-    assert size(shape) <= 0.6 * 0.4 * 0.2 * ROUNDING
+    assert volume(shape.geometry) <= 0.6 * 0.4 * 0.2 * ROUNDING
 
 
 @pytest.mark.parametrize(
@@ -368,7 +336,7 @@ def test_a_dense_round_hull_is_enclosed_tightly() -> None:
         (np.vstack([CUBE, [0.0, 0.0, np.nan]]), "not finite"),
     ],
 )
-def test_points_without_volume_are_an_error(points: Array, reason: str) -> None:
+def test_points_without_volume_are_an_error(points, reason):
     with pytest.raises(FitError, match=reason):
         enclose(points)
     with pytest.raises(ValueError, match=r"\(8, 2\); expected \(n, 3\)"):
@@ -400,7 +368,7 @@ def volume_of(spheres, rng):
 
 def test_balls_are_found_again():
     shapes = [Shape(Sphere(r), Pose((x, y, z))) for x, y, z, r in BALLS]
-    found = best_spheres(sample_solid(solid_of(shapes), 0), len(BALLS), None, 0)
+    found = search.best_spheres(search.sample_solid(solid_of(shapes), 0), len(BALLS), None, 0)
     assert found.iou > 0.97
     np.testing.assert_allclose(spheres_of(found.shapes), sorted(BALLS), atol=1.5e-3)
 
@@ -512,22 +480,16 @@ def test_faults_of_the_cache_are_reported(made, tmp_path, monkeypatch, caplog):
 BLOCK = Shape(Box((0.4, 0.2, 0.1)))
 UNIT_CUBE = Shape(Box((0.2, 0.2, 0.2)))
 TILTED_POSE = Pose.from_xyz_rpy((0.3, -0.2, 0.5), (0.4, -1.1, 2.0))
-GEOMETRY_KINDS = [Box((0.3, 0.2, 0.4)), Cylinder(0.15, 0.3), Sphere(0.2), Capsule(0.1, 0.25)]
 DISTANCES = ("protrusion_mean", "protrusion_p95", "gap_mean", "gap_p95", "hausdorff")
 SHARES = ("iou", "coverage", "volume_ratio")
 
 
-def at(x: float, y: float = 0.0, z: float = 0.0) -> Pose:
+def at(x, y=0.0, z=0.0):
     return Pose((x, y, z))
 
 
-def solid(*pieces: tuple[Box, Pose]) -> Solid:
-    return solid_of([Shape(box, pose) for box, pose in pieces])
-
-
-def assert_perfect(found: Quality) -> None:
-    assert [getattr(found, name) for name in SHARES] == [1.0, 1.0, 1.0]
-    assert max(getattr(found, name) for name in DISTANCES) < 1e-7
+def box(size, pose=IDENTITY):
+    return Shape(Box(size), pose)
 
 
 @pytest.mark.parametrize(
@@ -553,16 +515,25 @@ def test_signed_distances_of_one_primitive_are_exact(geometry, point, expected, 
 
 
 def test_the_signed_distance_of_a_union_is_that_of_the_nearest_primitive():
-    pair = [Shape(Box((2, 2, 2)), at(-0.5)), Shape(Box((2, 2, 2)), at(0.5))]
+    pair = [box((2, 2, 2), at(-0.5)), box((2, 2, 2), at(0.5))]
     distances = signed_distance(pair, np.array([[3, 0, 0], [-4.5, 0, 5], [0, 0, 0], [0, 0, 0.9]]))
     np.testing.assert_allclose(distances, [1.5, 5, -0.5, -0.1], atol=1e-12)
-    crossed = [Shape(Box((2, 2, 2)), at(-0.8)), Shape(Box((2, 2, 2)), at(0.8))]
+    crossed = [box((2, 2, 2), at(-0.8)), box((2, 2, 2), at(0.8))]
     assert signed_distance(crossed, np.zeros((1, 3))) == pytest.approx([-0.2])
 
 
-@pytest.mark.parametrize("shape", [BLOCK, UNIT_CUBE, Shape(Box((0.1, 0.2, 0.3)), TILTED_POSE)])
-def test_a_box_is_a_perfect_fit_of_itself(shape):
-    assert_perfect(quality(solid_of([shape]), [shape]))
+@pytest.mark.parametrize(
+    ("whole", "pieces"),
+    [
+        *((shape, [shape]) for shape in (BLOCK, UNIT_CUBE, box((0.1, 0.2, 0.3), TILTED_POSE))),
+        (box((0.3, 0.2, 0.1)), [box((0.2, 0.2, 0.1), at(x)) for x in (-0.05, 0.05)]),  # overlap
+        (box((0.4, 0.2, 0.1)), [box((0.2, 0.2, 0.1), at(x)) for x in (-0.1, 0.1)]),
+    ],
+)
+def test_a_box_is_a_perfect_fit_of_itself_and_of_its_pieces(whole, pieces):
+    measures = quality(solid_of([whole]), pieces)
+    assert [getattr(measures, name) for name in SHARES] == [1.0, 1.0, 1.0]
+    assert max(getattr(measures, name) for name in DISTANCES) < 1e-7
 
 
 def test_a_box_a_tenth_too_long_protrudes_by_the_excess():
@@ -599,19 +570,13 @@ def test_a_cylinder_fits_its_tessellation_up_to_the_sagitta():
     assert measures.gap_mean < 1e-9
 
 
-@pytest.mark.parametrize("shift", [0.05, 0.1])
-def test_the_overlap_of_two_boxes_is_counted_once(shift):
-    pair = [Shape(Box((0.2, 0.2, 0.1)), at(-shift)), Shape(Box((0.2, 0.2, 0.1)), at(shift))]
-    assert_perfect(quality(solid((Box((0.2 + 2 * shift, 0.2, 0.1)), Pose())), pair))
-
-
 @pytest.mark.parametrize(
     "idle",
-    [Shape(Sphere(0.09)), Shape(Box((0.2, 0.2, 0.1)), at(0, 0, 0.05)), UNIT_CUBE],
+    [Shape(Sphere(0.09)), box((0.2, 0.2, 0.1), at(0, 0, 0.05)), UNIT_CUBE],
     ids=["within", "flush", "equal"],
 )
 def test_a_primitive_inside_another_changes_nothing(idle):
-    small = solid((Box((0.04, 0.04, 0.04)), at(0, 0, -0.06)))
+    small = solid_of([box((0.04, 0.04, 0.04), at(0, 0, -0.06))])
     once = quality(small, [UNIT_CUBE])
     for both in ([UNIT_CUBE, idle], [idle, UNIT_CUBE]):
         measures = quality(small, both)
@@ -621,10 +586,8 @@ def test_a_primitive_inside_another_changes_nothing(idle):
 
 def test_protrusion_of_a_thin_skin_equals_its_thickness():
     skin = 1e-4
-    pair = [
-        Shape(Box((0.3 + skin, 0.2 + 2 * skin, 0.1 + 2 * skin)), at(sign * (0.05 + skin / 2)))
-        for sign in (-1, 1)
-    ]
+    size = (0.3 + skin, 0.2 + 2 * skin, 0.1 + 2 * skin)
+    pair = [box(size, at(x)) for x in (-0.05 - skin / 2, 0.05 + skin / 2)]
     measures = quality(solid_of([BLOCK]), pair)
     assert measures.coverage == 1
     assert measures.protrusion_mean == pytest.approx(skin, rel=0.01)
@@ -654,28 +617,22 @@ def test_disjoint_shapes_have_no_overlap():
 
 @pytest.mark.parametrize(
     "primitives",
-    [
-        [UNIT_CUBE],
-        [Shape(Box((0.11, 0.2, 0.2)), at(-0.045)), Shape(Box((0.12, 0.2, 0.2)), at(0.04))],
-    ],
+    [[UNIT_CUBE], [box((0.11, 0.2, 0.2), at(-0.045)), box((0.12, 0.2, 0.2), at(0.04))]],
 )
 def test_the_hausdorff_distance_of_a_filled_slot_is_its_depth(primitives):
-    slotted = solid(
-        (Box((0.096, 0.2, 0.2)), at(-0.052)),
-        (Box((0.096, 0.2, 0.2)), at(0.052)),
-        (Box((0.2, 0.2, 0.02)), at(0, 0, -0.09)),
-    )
-    measures = quality(slotted, primitives)
+    prongs = [box((0.096, 0.2, 0.2), at(x)) for x in (-0.052, 0.052)]
+    measures = quality(solid_of([*prongs, box((0.2, 0.2, 0.02), at(0, 0, -0.09))]), primitives)
     assert measures.iou == pytest.approx(1 - 0.008 * 0.18 / 0.04, abs=1e-3)
     assert measures.protrusion_p95 < 1e-7
     assert measures.protrusion_mean < 1e-4
     assert measures.hausdorff == pytest.approx(0.096, abs=2e-4)
 
 
-@pytest.mark.parametrize("geometry", GEOMETRY_KINDS)
+@pytest.mark.parametrize(
+    "geometry", [Box((0.3, 0.2, 0.4)), Cylinder(0.15, 0.3), Sphere(0.2), Capsule(0.1, 0.25)]
+)
 def test_surfaces_are_sampled_uniformly(geometry):
-    kernel = Shape(Box((0.02, 0.05, 0.01)), TILTED_POSE @ at(0.05, 0.02, 0.03))
-    small = solid_of([kernel])
+    small = solid_of([box((0.02, 0.05, 0.01), TILTED_POSE @ at(0.05, 0.02, 0.03))])
     measures = quality(small, [Shape(geometry, TILTED_POSE)])
     mesh = solid_mesh(geometry).copy()
     for _ in range(2 if isinstance(geometry, Sphere) else 0):
@@ -706,6 +663,6 @@ def test_meshes_empty_lists_and_flat_boxes_are_errors(tmp_path):
             quality(cube, wrong)
         with pytest.raises(ValueError, match="primitive"):
             signed_distance(wrong, np.zeros((1, 3)))
-    speck = solid((Box((1e-3, 1e-3, 1e-3)), Pose()))
+    speck = solid_of([box((1e-3, 1e-3, 1e-3))])
     with pytest.raises(FitError, match="none of 64 sample points"):
         quality(speck, [Shape(Sphere(1.0), at(5))], volume_points=64)

@@ -5,7 +5,6 @@ import math
 import pickle
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,20 +34,13 @@ def written(robot, folder):
     return path
 
 
-def text_file(folder, text):
-    path = folder / "robot.urdf"
-    path.write_text(text)
-    return path
-
-
 def test_links_are_sorted_from_the_root_and_missing_limits_are_not_zero(tmp_path):
-    path = text_file(
-        tmp_path,
+    robot = reading(
         '<robot name="r"><link name="c"/><link name="a"/><link name="b"/>'
         '<joint name="j2" type="fixed"><parent link="b"/><child link="c"/></joint>'
         '<joint name="j1" type="revolute"><parent link="a"/><child link="b"/></joint></robot>',
+        tmp_path,
     )
-    robot = read_urdf(path)
     assert [link.name for link in robot.links] == ["a", "b", "c"]
     assert (robot.joints[0].limits, robot.joints[0].effort) == (None, None)
 
@@ -82,18 +74,6 @@ def test_a_home_that_is_not_a_number_is_an_error(tmp_path, position):
         read_robot(path)
 
 
-def test_a_rotated_inertial_frame_is_expressed_in_link_axes(tmp_path):
-    path = text_file(
-        tmp_path,
-        '<robot name="r"><link name="a"><inertial><origin rpy="0 0 1.5707963267948966"/>'
-        '<mass value="1"/><inertia ixx="1" iyy="2" izz="3" ixy="0" ixz="0" iyz="0"/></inertial>'
-        "</link></robot>",
-    )
-    inertial = read_urdf(path).root.inertial
-    assert inertial is not None
-    np.testing.assert_allclose(np.diag(inertial.matrix), [2, 1, 3], atol=1e-12)
-
-
 def test_a_capsule_is_written_as_cylinder_and_spheres_and_read_back(tmp_path):
     T = Pose.from_xyz_rpy((0.1, 0, 0), (1.0, 0, 0))
     others = (Shape(Sphere(0.05)), Shape(Cylinder(0.05, 0.1)))
@@ -111,13 +91,8 @@ def test_a_capsule_is_written_as_cylinder_and_spheres_and_read_back(tmp_path):
 
 
 def test_a_missing_mesh_is_an_error(tmp_path):
-    path = text_file(
-        tmp_path,
-        '<robot name="r"><link name="a"><visual><geometry><mesh filename="gone.stl"/></geometry>'
-        "</visual></link></robot>",
-    )
     with pytest.raises(UnsoundError, match=r"gone\.stl") as caught:
-        read_urdf(path)
+        reading(urdf(base=MESH.format("gone.stl")), tmp_path)
     assert caught.value.findings[0].code == "mesh-unresolved"
     sent = pickle.loads(pickle.dumps(caught.value))  # as a worker process sends it
     assert (str(sent), sent.findings) == (str(caught.value), caught.value.findings)
@@ -149,7 +124,7 @@ def urdf(base="", tip="", more="", origin="", com=""):
     )
 
 
-def reading(text: str, folder: Path, **options: bool) -> Robot:
+def reading(text, folder, **options):
     path = folder / "r.urdf"
     folder.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
@@ -161,16 +136,17 @@ def codes(robot):
 
 
 @pytest.mark.parametrize(
-    ("quaternion", "R"),
+    ("rotation", "R"),
     [
-        (f"0 0 {S} {S}", [[0, -1, 0], [1, 0, 0], [0, 0, 1]]),
-        ("0 0 -3 -3", [[0, -1, 0], [1, 0, 0], [0, 0, 1]]),
-        (f"0 {S} 0 {S}", [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
-        ("0.5 0.5 0.5 0.5", [[0, 0, 1], [1, 0, 0], [0, 1, 0]]),
+        (f'quat_xyzw="0 0 {S} {S}"', [[0, -1, 0], [1, 0, 0], [0, 0, 1]]),
+        ('quat_xyzw="0 0 -3 -3"', [[0, -1, 0], [1, 0, 0], [0, 0, 1]]),
+        (f'quat_xyzw="0 {S} 0 {S}"', [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
+        ('quat_xyzw="0.5 0.5 0.5 0.5"', [[0, 0, 1], [1, 0, 0], [0, 1, 0]]),
+        ('rpy="0 0 1.5707963267948966"', [[0, -1, 0], [1, 0, 0], [0, 0, 1]]),
     ],
 )
-def test_quaternions_of_joints_shapes_and_inertias_are_read(tmp_path, quaternion, R):
-    origin = f'<origin xyz="0.1 0 0" quat_xyzw="{quaternion}"/>'
+def test_rotations_of_joints_shapes_and_inertias_are_read(tmp_path, rotation, R):
+    origin = f'<origin xyz="0.1 0 0" {rotation}/>'
     tip = f"<visual>{origin}{BALL}</visual><collision>{origin}{BALL}</collision>"
     robot = reading(urdf(tip=tip, origin=origin, com=origin), tmp_path)
     link = robot.links[1]
@@ -382,20 +358,17 @@ def free(kind, parent, child):
         ('<link name="world"/>' + free("planar", "world", "base"), 1),
         (
             f'<link name="world"><visual>{BALL}</visual></link><link name="table"/>'
-            + free("fixed", "world", "table")
-            + free("floating", "world", "base"),
+            f"{free('fixed', 'world', 'table')}{free('floating', 'world', 'base')}",
             2,
         ),
         (
             '<link name="odom"/><link name="foot"/>'
-            + free("planar", "odom", "foot")
-            + free("fixed", "foot", "base"),
+            f"{free('planar', 'odom', 'foot')}{free('fixed', 'foot', 'base')}",
             1,
         ),
         (
             '<link name="map"/><link name="odom"/>'
-            + free("planar", "map", "odom")
-            + free("floating", "odom", "base"),
+            f"{free('planar', 'map', 'odom')}{free('floating', 'odom', 'base')}",
             2,
         ),
     ],
@@ -414,8 +387,7 @@ def test_a_free_base_is_left_out_with_a_finding(tmp_path, more, num_links):
     [
         '<link name="box"/>' + free("floating", "tip", "box"),
         '<link name="w"/><link name="box"/>'
-        + free("floating", "w", "base")
-        + free("floating", "w", "box"),
+        f"{free('floating', 'w', 'base')}{free('floating', 'w', 'box')}",
     ],
 )
 def test_a_free_joint_elsewhere_is_an_error(tmp_path, more):
@@ -446,10 +418,9 @@ def test_a_capsule_without_a_length_is_an_error(tmp_path):
 
 
 def test_the_findings_of_a_bundle_do_not_name_what_morphgen_wrote(tmp_path):
-    path = tmp_path / "r.urdf"
-    path.write_text(urdf(tip=f"<visual>{BALL}</visual>"))
-    assert main(["import", str(path), "--out", str(tmp_path), "--no-picture"]) in (0, 1)
-    assert read_urdf(tmp_path / "r" / "robot.urdf").source_findings == ()
+    robot = reading(urdf(tip=f"<visual>{BALL}</visual>"), tmp_path)
+    folder = write_bundle(robot, tmp_path / "bundle", picture=False)
+    assert read_urdf(folder / "robot.urdf").source_findings == ()
 
 
 @pytest.mark.parametrize(
