@@ -140,9 +140,7 @@ def test_a_rejected_file_fails_the_row_of_its_loader(tmp_path):
 
 
 def test_a_missing_loader_is_reported(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        module, "find_spec", lambda name: None if name == "pinocchio" else find_spec(name)
-    )
+    monkeypatch.setattr(module, "find_spec", lambda n: None if n == "pinocchio" else find_spec(n))
     report = conformance(bundle(arm(), tmp_path), samples=2)
     row = next(row for row in report.rows if row.loader == "pinocchio")
     assert (row.passed, row.message) == (None, "not installed")
@@ -185,9 +183,7 @@ def test_each_loader_that_reads_a_value_notices_another_one(
 
 def test_a_chain_of_mimic_joints_counts_as_its_product(tmp_path):
     robot = massless_tree()
-    last = Joint(
-        "last", "revolute", "follower", "end", limits=(-9.0, 9.0), effort=1.0, velocity=1.0
-    )
+    last = Joint("last", "revolute", "follower", "end", limits=(-9.0, 9.0), effort=1, velocity=1)
     chained = replace(last, mimic=Mimic("follow", 2.0, 0.1))
     robot = replace(robot, links=(*robot.links, rod("end")), joints=(*robot.joints, chained))
     folder = bundle(robot, tmp_path)

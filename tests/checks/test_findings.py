@@ -75,10 +75,8 @@ def test_a_mimic_gripper_has_only_the_finding_about_loaders():
 def test_each_fault_has_its_finding_and_all_are_sorted(code, tmp_path):
     findings = check(faulty(code, tmp_path))
     assert code in {finding.code for finding in findings}
-    rank = ["error", "warning", "info"]
-    assert list(findings) == sorted(
-        findings, key=lambda f: (rank.index(f.severity), f.code, f.where)
-    )
+    rank = {"error": 0, "warning": 1, "info": 2}
+    assert list(findings) == sorted(findings, key=lambda f: (rank[f.severity], f.code, f.where))
     assert findings == check(faulty(code, tmp_path))
     assert all(f.why and f.fix and "\n" not in f.why + f.fix for f in findings)
 
@@ -184,19 +182,13 @@ def test_joints_are_repaired_together_with_home():
     assert joint.limits == (-0.2, 0.2)
     assert (joint.effort, joint.velocity) == (DEFAULT_EFFORT, DEFAULT_VELOCITY)
     assert robot.home[0] == 0.2
-    assert {finding.code for finding in gone} == {
-        "axis-not-unit",
-        "effort-missing",
-        "home-outside-limits",
-        "limits-inverted",
-        "velocity-missing",
-    }
+    faults = "axis-not-unit effort-missing home-outside-limits limits-inverted velocity-missing"
+    assert {finding.code for finding in gone} == set(faults.split())
 
 
 def test_a_nan_home_becomes_the_position_within_limits_nearest_to_zero():
-    broken = replace(
-        with_joint(valid_robot(), "shoulder", limits=(0.3, 1.0)), home=(math.nan, 0, 0, 0, 0)
-    )
+    shifted = with_joint(valid_robot(), "shoulder", limits=(0.3, 1.0))
+    broken = replace(shifted, home=(math.nan, 0, 0, 0, 0))
     assert fix(broken)[0].home[0] == 0.3
 
 
@@ -221,10 +213,8 @@ def test_several_faults_are_repaired_together():
 
 
 def test_a_link_without_solid_geometry_is_not_repaired():
-    body = valid_robot().link("lower").inertial
-    broken = with_link(
-        valid_robot(), "lower", inertial=replace(body, mass=-1.0), collisions=(), visuals=()
-    )
+    bad = replace(valid_robot().link("lower").inertial, mass=-1.0)
+    broken = with_link(valid_robot(), "lower", inertial=bad, collisions=(), visuals=())
     finding = next(finding for finding in check(broken) if finding.code == "mass-invalid")
     assert not finding.fixable
     assert fix(broken)[1] == ()
@@ -340,22 +330,16 @@ def test_distances_of_primitives_agree_with_their_triangles(seed):
             direction = rng.choice([-1.0, 0.0, 1.0], 3)
             direction[rng.integers(3)] = 1.0
             way = direction / np.linalg.norm(direction)
-            touching = [
-                not gap_findings(pair(a, b, Pose.from_xyz_rpy(tuple(far * way), rpy)))
-                for far in (0.0, 0.02, 0.35)
-            ]
-            assert touching == [True, True, False]
+            poses = (Pose.from_xyz_rpy(tuple(far * way), rpy) for far in (0.0, 0.02, 0.35))
+            assert [not gap_findings(pair(a, b, T)) for T in poses] == [True, True, False]
 
 
 def test_unreadable_shapes_and_invalid_joints_are_left_to_other_checks(tmp_path):
-    (tmp_path / "bad.stl").write_text("no mesh")
-    gone = pair(Mesh(tmp_path / "gone.stl"), Sphere(0.1), Pose((1.0, 0.0, 0.0)))
-    broken = pair(Mesh(tmp_path / "bad.stl"), Sphere(0.1), Pose((1.0, 0.0, 0.0)))
-    flat = pair(Box((0.0, 0.1, 0.1)), Sphere(0.1), Pose((1.0, 0.0, 0.0)))
-    scale = pair(Mesh(tmp_path / "bad.stl", (0.0, 1.0, 1.0)), Sphere(0.1), Pose((1.0, 0.0, 0.0)))
-    lost = replace(valid_robot(), home=(float("nan"), *valid_robot().home[1:]))
-    for robot in (gone, broken, flat, scale, lost):
-        assert gap_findings(robot) == []
+    gone, bad = tmp_path / "gone.stl", tmp_path / "bad.stl"
+    bad.write_text("no mesh")
+    for shape in (Mesh(gone), Mesh(bad), Mesh(bad, (0.0, 1.0, 1.0)), Box((0.0, 0.1, 0.1))):
+        assert gap_findings(pair(shape, Sphere(0.1), Pose((1.0, 0.0, 0.0)))) == []
+    assert gap_findings(replace(valid_robot(), home=(math.nan, *valid_robot().home[1:]))) == []
 
 
 @pytest.mark.parametrize("name", ["base", "upper"])

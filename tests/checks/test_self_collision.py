@@ -59,19 +59,16 @@ def test_a_margin_counts_gaps_as_negative_depths():
 
 
 def test_depths_are_those_of_spheres():
-    robot = slides(0.0, 0.3)
-    depths = penetrations(robot, [[0.0, 0.0], [0.0, -0.22], [0.25, 0.0]])
-    assert depths[0] == {}
-    assert depths[1] == {("ball0", "ball1"): pytest.approx(0.02, abs=1e-6)}
-    assert depths[2] == {("ball0", "ball1"): pytest.approx(0.05, abs=1e-6)}
+    depths = penetrations(slides(0.0, 0.3), [[0.0, 0.0], [0.0, -0.22], [0.25, 0.0]])
+    pair = ("ball0", "ball1")
+    assert depths == [{}, *({pair: pytest.approx(depth, abs=1e-6)} for depth in (0.02, 0.05))]
 
 
 def test_touching_faces_do_not_collide():
     block = (Shape(Box((0.1, 0.1, 0.1))),)
     robot = slides(0.0, 0.1)
-    robot = replace(
-        robot, links=(robot.root, *(replace(x, collisions=block) for x in robot.links[1:]))
-    )
+    blocks = (replace(link, collisions=block) for link in robot.links[1:])
+    robot = replace(robot, links=(robot.root, *blocks))
     clear, deep = penetrations(robot, [[0.0, -PENETRATION / 2], [0.0, -2 * PENETRATION]])
     assert clear == {}
     assert set(deep) == {("ball0", "ball1")}
@@ -109,16 +106,11 @@ def test_a_mesh_counts_as_its_convex_hull(tmp_path):
 )
 def test_links_across_a_joint_are_adjacent(names, fixed, pairs):
     robot = chain(*(Link(name) if name.isupper() else ball(name) for name in names))
-    joints = tuple(
-        replace(joint, kind="fixed") if joint.child == fixed else joint for joint in robot.joints
-    )
+    joints = tuple(replace(j, kind="fixed") if j.child == fixed else j for j in robot.joints)
     home = (0.0,) * sum(joint.is_independent for joint in joints)
     robot = replace(robot, joints=joints, home=home)
     assert adjacent_pairs(robot) == tuple(sorted((a, b) for a, b in pairs))
-
-
-def test_siblings_on_an_empty_root_are_not_adjacent():
-    assert adjacent_pairs(slides(0.0, 0.3)) == ()
+    assert adjacent_pairs(slides(0.0, 0.3)) == ()  # siblings on an empty root
 
 
 def test_pairs_that_penetrate_at_home_are_ignored():
@@ -174,9 +166,7 @@ def test_free_is_where_nothing_penetrates():
     q = random_configurations(robot, 100, np.random.default_rng(0))
     free = checker.free(q)
     assert free.tolist() == [not contacts for contacts in checker.penetrations(q)]
-    touching = SelfCollisionChecker(slides(0.0, 0.1)).free(
-        [[0.0, -0.5 * PENETRATION], [0.0, -0.01]]
-    )
+    touching = SelfCollisionChecker(slides(0.0, 0.1)).free([[0.0, -PENETRATION / 2], [0.0, -0.01]])
     assert touching.tolist() == [True, False]
     assert checker.free(np.zeros((0, robot.dof))).tolist() == []
     for ask, wrong in ((checker.free, q[0]), (checker.penetrations, [[0.0]])):
@@ -269,9 +259,8 @@ def test_reasons_and_counts_agree_with_brute_force():
     matrix = collision_matrix(robot, samples=SAMPLES, seed=5)
     q = random_configurations(robot, SAMPLES, np.random.default_rng(5))
     colliding = colliding_pairs(robot, q)
-    counts = {
-        pair: sum(pair in pairs for pairs in colliding) for pair in sorted(set().union(*colliding))
-    }
+    seen = sorted(set().union(*colliding))
+    counts = {pair: sum(pair in pairs for pairs in colliding) for pair in seen}
     assert matrix.collisions == counts
     linked = {("base", "turn"), ("knob", "turn"), ("knob", "slide"), ("base", "post")}
     linked |= {("post", "top"), ("base", "carrier"), ("big", "carrier")}

@@ -81,9 +81,8 @@ def test_bundles_and_repetition_keep_the_pieces(bracket, tmp_path):
     assert as_convex(convex) == convex
     back = read_bundle(write_bundle(convex, tmp_path / "robots" / convex.name, picture=False))
     assert as_convex(back) == back
-    assert [len(link.collisions) for link in back.links] == [
-        len(link.collisions) for link in convex.links
-    ]
+    counts = [[len(link.collisions) for link in each.links] for each in (back, convex)]
+    assert counts[0] == counts[1]
     assert back.provenance["convex"] == convex.provenance["convex"]
     of_pieces, of_hulls = agreement(robot, back, 300)
     assert of_pieces.accuracy >= of_hulls.accuracy

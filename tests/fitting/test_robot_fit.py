@@ -111,9 +111,8 @@ def with_bar(mesh, size, at):
 def test_enclosing_primitives_contain_every_vertex(tmp_path):
     bent = with_bar(trimesh.creation.box((0.4, 0.1, 0.1)), (0.1, 0.1, 0.4), (0.15, 0, 0.15))
     shape = mesh_shape(tmp_path, bent)
-    one, three = (
-        fit_shapes([shape], FitOptions(max_primitives=k, iou=0.95, enclose=True)) for k in (1, 3)
-    )
+    options = (FitOptions(max_primitives=k, iou=0.95, enclose=True) for k in (1, 3))
+    one, three = (fit_shapes([shape], each) for each in options)
     for fit in (one, three):
         assert signed_distance(fit.primitives, np.asarray(bent.vertices)).max() <= 1e-9
         assert fit.quality.coverage > 0.999
@@ -137,10 +136,9 @@ def test_replacing_collisions_preserves_masses_and_joints():
     primitive_robot = morphgen.compose("arm=ur5 ee=plane", geometry="primitive")
     written = as_written(meshes)
     assert primitive_robot.joints == written.joints
-    for link, before, original in zip(
-        primitive_robot.links, written.links, meshes.links, strict=True
-    ):
-        assert (link.inertial, link.visuals) == (before.inertial, original.visuals)
+    kept = [(link.inertial, link.visuals) for link in primitive_robot.links]
+    inertials = [link.inertial for link in written.links]
+    assert kept == [*zip(inertials, (link.visuals for link in meshes.links), strict=True)]
     collisions = [s for link in primitive_robot.links for s in link.collisions]
     assert not any(isinstance(shape.geometry, Mesh) for shape in collisions)
     assert list(SelfCollisionChecker(primitive_robot).penetrations([primitive_robot.home])) == [{}]
@@ -254,9 +252,7 @@ def test_a_template_with_a_mesh_is_fitted_stored_and_used(own_parts, monkeypatch
     assert main(["fit", "--all", "--missing", "--library", str(own_parts)]) == 0
     stored = own_parts / f"my_wedge{SUFFIX}"
     assert [path.name for path in own_parts.glob(f"*{SUFFIX}")] == [stored.name]
-    monkeypatch.setattr(
-        token_shapes_module, "fit_primitive", lambda shapes: pytest.fail("a fit was searched for")
-    )
+    monkeypatch.setattr(token_shapes_module, "fit_primitive", lambda shapes: pytest.fail("search"))
     robot = morphgen.compose("base=fixed ee=my_wedge", library=[own_parts])
     (token,) = token_shapes(robot).values()
     assert token.geometry.size == pytest.approx((0.04, 0.06, 0.1), abs=2e-3)

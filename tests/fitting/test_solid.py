@@ -8,14 +8,8 @@ import pytest
 import trimesh
 
 from morphgen.errors import FitError, MeshError
-from morphgen.fitting.solid import (
-    DECIMATED_FACES,
-    MAX_FACES,
-    Solid,
-    _Columns,
-    solid_of,
-    solid_of_mesh,
-)
+from morphgen.fitting import solid as module
+from morphgen.fitting.solid import Solid, _Columns, solid_of, solid_of_mesh
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere, volume
 
 SIZE = (0.2, 0.3, 0.4)
@@ -53,9 +47,8 @@ def without(mesh, dropped):
 
 def soup(corners):
     """Triangles, shape (n, 3, 3), that share no vertices."""
-    return trimesh.Trimesh(
-        corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False
-    )
+    faces = np.arange(3 * len(corners)).reshape(-1, 3)
+    return trimesh.Trimesh(corners.reshape(-1, 3), faces, process=False)
 
 
 def angle():
@@ -68,9 +61,9 @@ def angle():
     return trimesh.Trimesh(vertices, [*cap[:, ::-1], *(cap + 6), *walls])
 
 
-def strip(angle, n=24):
-    """A strip bent around z by an angle, with a radius of 0.2 and a width of 0.4."""
-    turns = np.linspace(0, angle, n)
+def half_tube(n=24):
+    """A strip bent around z by half a turn, with a radius of 0.2 and a width of 0.4."""
+    turns = np.linspace(0, math.pi, n)
     vertices = [(0.2 * math.cos(a), 0.2 * math.sin(a), z) for a in turns for z in (-0.2, 0.2)]
     firsts = [2 * i for i in range(n - 1)]
     faces = [three for i in firsts for three in ((i, i + 2, i + 1), (i + 1, i + 2, i + 3))]
@@ -194,7 +187,7 @@ def test_a_sphere_with_many_holes_is_solid_by_winding_number(inverted):
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_half_a_tube_is_solid_by_winding_number(turned):
-    mesh = strip(math.pi)
+    mesh = half_tube()
     if turned:
         mesh.invert()
     solid = solid_of_mesh(mesh)
@@ -259,7 +252,7 @@ def test_a_primitive_is_its_own_solid(geometry, pose):
 
 
 def test_shapes_of_all_kinds_form_one_solid_with_the_least_reliable_method(tmp_path):
-    whole = box()
+    crate = box()
     ball = trimesh.creation.icosphere(3, 0.1)
     holes = np.random.default_rng(0).random(len(ball.faces)) < 0.2
     closed = (
@@ -268,12 +261,11 @@ def test_shapes_of_all_kinds_form_one_solid_with_the_least_reliable_method(tmp_p
         Shape(Sphere(0.05), Pose((0, -0.2, 0))),
         Shape(Capsule(0.04, 0.1), Pose((0, 0, 0.15))),
     )
-    opened = write(without(whole, whole.face_normals[:, 2] > 0.5), tmp_path / "box.stl")
+    opened = write(without(crate, crate.face_normals[:, 2] > 0.5), tmp_path / "box.stl")
     ragged = write(without(ball, holes), tmp_path / "ball.stl")
     assert solid_of(closed).method == "watertight"
-    assert counted(solid_of(closed)) == pytest.approx(
-        sum(volume(shape.geometry) for shape in closed), rel=0.03
-    )
+    total = sum(volume(shape.geometry) for shape in closed)
+    assert counted(solid_of(closed)) == pytest.approx(total, rel=0.03)
     ends = np.array([(-0.2, 0, 0), (0.09, 0.2, 0), (-0.09, 0.2, 0), (0, -0.2, 0), (0, 0, 0.23)])
     assert solid_of(closed).contains(ends).all()
     assert not solid_of(closed).contains(ends + np.array((0, 0, 0.1))).any()
@@ -281,13 +273,14 @@ def test_shapes_of_all_kinds_form_one_solid_with_the_least_reliable_method(tmp_p
     assert solid_of([opened, ragged, *closed]).method == "winding"
 
 
-def test_a_very_large_mesh_is_decimated_and_records_its_face_count(tmp_path):
-    ball = trimesh.creation.icosphere(7, 0.2)
-    assert len(ball.faces) > MAX_FACES
+def test_a_very_large_mesh_is_decimated_and_records_its_face_count(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "MAX_FACES", 10_000)
+    monkeypatch.setattr(module, "DECIMATED_FACES", 5_000)
+    ball = trimesh.creation.icosphere(5, 0.2)
     solid = solid_of_mesh(ball)
     assert solid.method == "watertight"
     assert solid.decimated_from == len(ball.faces)
-    assert len(solid.mesh.faces) <= 1.01 * DECIMATED_FACES
+    assert len(solid.mesh.faces) <= 1.01 * 5_000
     assert solid.mesh.volume == pytest.approx(ball.volume, rel=0.01)
     assert counted(solid) == pytest.approx(volume(Sphere(0.2)), rel=0.01)
     several = solid_of([write(ball, tmp_path / "ball.stl"), Shape(Box(SIZE))])
@@ -336,8 +329,7 @@ def tube(wall=0.01, radius=0.1, length=0.6, closed=False):
 
 
 def solid_from(mesh, tmp_path):
-    mesh.export(tmp_path / "mesh.stl")
-    return solid_of([Shape(Mesh(tmp_path / "mesh.stl"))])
+    return solid_of([write(mesh, tmp_path / "mesh.stl")])
 
 
 @pytest.mark.parametrize("closed", [False, True])
@@ -348,18 +340,15 @@ def test_a_tube_is_filled_except_near_its_opening(tmp_path, closed):
     assert solid.contains(np.array([deep, mouth, beside])).tolist() == [True, False, False]
 
 
+PRONGS = [box((0.02, 0.1, 0.3), (x, 0, 0)) for x in (0.0, 0.15)]
+
+
 @pytest.mark.parametrize(
     "mesh",
     [
         trimesh.creation.annulus(0.4, 0.5, 0.1),
-        trimesh.util.concatenate(
-            [
-                box((0.02, 0.1, 0.3)),
-                box((0.02, 0.1, 0.3), (0.15, 0, 0)),
-                box((0.17, 0.1, 0.02), (0.075, 0, -0.16)),
-            ]
-        ),
-        trimesh.creation.box((0.3, 0.2, 0.1)),
+        trimesh.util.concatenate([*PRONGS, box((0.17, 0.1, 0.02), (0.075, 0, -0.16))]),
+        box((0.3, 0.2, 0.1)),
     ],
     ids=["ring", "fork", "box"],
 )

@@ -136,9 +136,7 @@ ROBOT = morphgen.compose(WORDS)
 @pytest.fixture(autouse=True)
 def no_search(monkeypatch, tmp_path):
     monkeypatch.setattr(module, "user_cache_path", lambda name: tmp_path / "cache" / name)
-    monkeypatch.setattr(
-        module, "fit_primitive", lambda shapes: pytest.fail("a fit was searched for")
-    )
+    monkeypatch.setattr(module, "fit_primitive", lambda shapes: pytest.fail("searched"))
 
 
 @pytest.fixture(scope="module")
@@ -155,9 +153,8 @@ def bundle_folder(written, tmp_path):
 def test_a_bundle_contains_the_fits_of_its_parts(bundle_folder):
     back = read_bundle(bundle_folder)
     assert token_shapes(back) == token_shapes(ROBOT)
-    ours, theirs = (
-        [link.collisions for link in as_primitives(each, ()).links] for each in (ROBOT, back)
-    )
+    robots = [as_primitives(each, ()) for each in (ROBOT, back)]
+    ours, theirs = ([link.collisions for link in robot.links] for robot in robots)
     assert ours == theirs
 
 
@@ -165,9 +162,8 @@ def test_token_shapes_do_not_depend_on_the_collision_geometry(tmp_path):
     primitive_robot = morphgen.compose(WORDS, geometry="primitive")
     back = read_bundle(write_bundle(primitive_robot, tmp_path / "prims", picture=False))
     assert token_shapes(primitive_robot) == token_shapes(back) == token_shapes(ROBOT)
-    assert token_shapes(ROBOT)["arm_upper_arm_link"].geometry.radius == pytest.approx(
-        0.0545, abs=1e-4
-    )
+    upper_arm = token_shapes(ROBOT)["arm_upper_arm_link"].geometry
+    assert upper_arm.radius == pytest.approx(0.0545, abs=1e-4)
 
 
 def test_fits_are_kept_when_a_bundle_is_rewritten(bundle_folder, tmp_path):

@@ -228,9 +228,8 @@ def test_the_folders_of_an_mjcf_compiler_do_not_lead_outside(kind, folder):
     for attribute in ("meshdir", "assetdir", "texturedir"):
         for file in ("secret.stl", "../outside/secret.stl", "link-secret.stl"):
             asset = f'<asset><mesh name="m" file="{file}"/></asset>'
-            path.write_text(
-                MJCF_TEXT.format(f'<compiler {attribute}="{where}"/>{asset}', MESH_GEOM)
-            )
+            compiler = f'<compiler {attribute}="{where}"/>'
+            path.write_text(MJCF_TEXT.format(compiler + asset, MESH_GEOM))
             for read in READERS.values():
                 with pytest.raises(MorphgenError):
                     read(path)
@@ -326,22 +325,18 @@ def test_the_mesh_files_of_a_robot_are_bounded_in_all(sizes, suffix, reader, fol
 
 
 @pytest.mark.parametrize("counts", [(1, 1), (2, 0), (0, 0, 0, 0, 0, 2)])
-@pytest.mark.parametrize("use", ["check", "split_colours", "copy"])
+@pytest.mark.parametrize("use", [check, split_colours, copy])
 def test_the_triangles_of_a_robot_are_bounded_in_all(counts, use, folder, monkeypatch):
     meshes = [export_stl(trimesh.creation.icosphere(n, radius=0.1)) for n in counts]
     faces = sum(20 * 4**n for n in counts)
     path = many_meshes(folder, "urdf", meshes)
     robot = read_description(path)
-    uses = {
-        "check": lambda: check(robot),
-        "split_colours": lambda: split_colours(robot),
-        "copy": lambda: copy(path),
-    }
+    argument = path if use is copy else robot
     monkeypatch.setattr(mesh_module, "MAX_ROBOT_FACES", faces)
-    uses[use]()
+    use(argument)
     monkeypatch.setattr(mesh_module, "MAX_ROBOT_FACES", faces - 1)
     with pytest.raises(MorphgenError, match=f"meshes have {faces} triangles or more"):
-        uses[use]()
+        use(argument)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
@@ -652,9 +647,8 @@ libc.fflush(None)
 
 @pytest.mark.skipif(os.name != "posix", reason="C's buffers are reached by POSIX's names")
 def test_buffered_c_output_is_not_printed_at_exit():
-    result = subprocess.run(
-        [sys.executable, "-c", PRINTING], capture_output=True, text=True, check=True
-    )
+    command = [sys.executable, "-c", PRINTING]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
     assert result.stdout == "after\n"
     assert result.stderr == ""
 

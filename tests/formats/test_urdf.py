@@ -60,9 +60,7 @@ def test_a_urdf_without_its_bundle_keeps_tool_and_home(tmp_path):
     assert alone.home == arm().home
     (tool,), (expected,) = alone.frames, arm().frames
     assert (tool.name, tool.link) == (expected.name, expected.link)
-    np.testing.assert_allclose(
-        tool.T_link_frame.matrix, expected.T_link_frame.matrix, rtol=0, atol=1e-9
-    )
+    assert tool.T_link_frame.matrix == pytest.approx(expected.T_link_frame.matrix, rel=0, abs=1e-9)
     assert [link.name for link in alone.links] == [link.name for link in arm().links]
 
 
@@ -461,9 +459,8 @@ RANDOM = RNG.uniform(-math.pi, math.pi, (200, 3)).tolist()
 
 def from_file(pose):
     """Return the pose after writing it to a URDF and reading it."""
-    xyz, rpy = (
-        [float(format_number(value)) for value in triple] for triple in (pose.position, pose.rpy)
-    )
+    triples = (pose.position, pose.rpy)
+    xyz, rpy = ([float(format_number(value)) for value in triple] for triple in triples)
     return Pose.from_xyz_rpy(xyz, rpy)
 
 

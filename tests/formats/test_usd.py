@@ -67,9 +67,8 @@ def test_the_folder_stands_alone(folder, stage):
 
 
 def test_every_collision_mesh_is_a_hull(stage):
-    meshes = sum(
-        isinstance(shape.geometry, Mesh) for link in ROBOT.links for shape in link.collisions
-    )
+    shapes = [shape for link in ROBOT.links for shape in link.collisions]
+    meshes = sum(isinstance(shape.geometry, Mesh) for shape in shapes)
     approximations = [
         prim.GetAttribute("physics:approximation").Get()
         for prim in stage.Traverse()

@@ -253,12 +253,8 @@ def test_a_derivation_with_a_mount_yaw_out_of_range_is_an_error(yaw):
         compose(fixed(("top", arm)), LIBRARY, "robot")
 
 
-OVERLAPPING = {
-    ("jaco2", "so101_jaw"),
-    ("lwr", "so101_jaw"),
-    ("yumi_right", "so101_jaw"),
-    ("yumi_right", "panda_hand"),
-}
+OVERLAPPING = {(arm, "so101_jaw") for arm in ("jaco2", "lwr", "yumi_right")}
+OVERLAPPING |= {("yumi_right", "panda_hand")}
 """Hands whose shapes reach behind the flange, into the arm: the card says so."""
 
 
@@ -276,9 +272,8 @@ def conforms(arm, ee, tmp_path, samples):
     findings = check(robot)
     codes = {finding.code for finding in findings if finding.severity != "info"}
     assert codes == ({"self-collision"} if (arm, ee) in OVERLAPPING else set())
-    report = conformance(
-        write_bundle(robot, tmp_path / robot.name, findings, picture=False), samples
-    )
+    folder = write_bundle(robot, tmp_path / robot.name, findings, picture=False)
+    report = conformance(folder, samples)
     assert report.passed
     assert len(report.rows) == len(LOADERS) == 6
     missing = {loader.name for loader in LOADERS if find_spec(loader.module) is None}

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped
@@ -141,9 +141,8 @@ def test_a_weight_may_be_random():
 def test_repetition_counts_are_uniform():
     robot_grammar = grammar("robot -> post beam{2,4}")
     rng = np.random.default_rng(0)
-    counts = [
-        len(labels(derive(robot_grammar, LIBRARY, RandomChooser(rng)))) - 1 for _ in range(900)
-    ]
+    drawn = [derive(robot_grammar, LIBRARY, RandomChooser(rng)) for _ in range(900)]
+    counts = [len(labels(tree)) - 1 for tree in drawn]
     assert [counts.count(n) / 900 for n in (2, 3, 4)] == pytest.approx([1 / 3] * 3, abs=0.05)
 
 
@@ -160,9 +159,8 @@ def test_recorded_choices_reproduce_the_derivation(name):
 
 
 def test_invalid_recorded_choices_fall_back_to_the_other_chooser():
-    robot_grammar = grammar(
-        "robot -> post links", "links -> beam(length=uniform(0.1, 0.5)){2,4} | jaw"
-    )
+    links = "links -> beam(length=uniform(0.1, 0.5)){2,4} | jaw"
+    robot_grammar = grammar("robot -> post links", links)
     given = {"robot/1.links": 7.0, "robot/1.links/0.beam#": 9.0, "nowhere": 1.0}
     repeated = derive(robot_grammar, LIBRARY, RecordedChooser(FirstChooser(), given))
     assert repeated == derive(robot_grammar, LIBRARY, FirstChooser())
@@ -170,8 +168,7 @@ def test_invalid_recorded_choices_fall_back_to_the_other_chooser():
 
 def test_a_recursion_may_terminate():
     robot_grammar = grammar("robot -> slides tail", "tail -> bead | bead tail")
-    sizes = {sum(1 for _ in draw(robot_grammar, seed).walk()) for seed in range(30)}
-    assert {2, 3, 4} <= sizes
+    assert {2, 3, 4} <= {len(labels(draw(robot_grammar, seed))) for seed in range(30)}
 
 
 @pytest.mark.parametrize(
@@ -241,6 +238,7 @@ TREES = st.recursive(
 )
 
 
+@settings(max_examples=50)
 @given(TREES)
 def test_printing_and_parsing_a_derivation_round_trips(tree):
     assert str(parse_derivation(str(tree))) == str(tree)
@@ -264,11 +262,7 @@ def test_a_difference_lists_parts_and_parameters():
 
 def test_an_outline_has_one_line_per_part():
     tree = parse_derivation("base=fixed[top: arm=ur5[flange: ee=plane(size=0.1)]]")
-    assert outline(tree).splitlines() == [
-        "base=fixed",
-        "  top: arm=ur5",
-        "    flange: ee=plane(size=0.1)",
-    ]
+    assert outline(tree) == "base=fixed\n  top: arm=ur5\n    flange: ee=plane(size=0.1)"
 
 
 def derived(text):
@@ -291,35 +285,25 @@ def test_limbs_attach_to_named_ports():
     text = "base=pedestal left.arm=ur5 left.ee=stick right.arm=xarm7 right.ee=panda_hand"
     derivation = derived(text)
     assert [port for port, _ in derivation.children] == ["left", "right"]
-    labels = [node.label for node in derivation.walk()]
-    assert labels == ["base", "left_arm", "left_ee", "right_arm", "right_ee"]
+    assert labels(derivation) == ["base", "left_arm", "left_ee", "right_arm", "right_ee"]
     assert default_name(derivation, LIBRARY) == "pedestal-left-ur5-stick-right-xarm7-panda_hand"
 
 
 def test_an_arm_with_two_ports_takes_an_end_effector_on_each():
     derivation = derived("arm=yumi left.ee=yumi_gripper")
-    assert [node.label for node in derivation.walk()] == ["base", "arm", "left_ee", "right_ee"]
+    assert labels(derivation) == ["base", "arm", "left_ee", "right_ee"]
     assert [node.part for node in derivation.walk()][2:] == ["yumi_gripper", "none"]
 
 
-def test_an_end_effector_may_attach_to_the_base():
-    assert default_name(derived("base=gantry ee=plane"), LIBRARY) == "gantry-plane"
-
-
-def test_different_robots_have_different_names():
-    ports = ("left.ee", "right.ee", "ee")
-    texts = ["arm=yumi left.ee=stick", "arm=yumi right.ee=stick"]
-    texts += [f"base=pedestal {port}=stick" for port in ports]
-    assert len({default_name(derived(text), LIBRARY) for text in texts}) == len(texts)
-
-
-def test_the_name_marks_changed_parameters():
-    plain = default_name(derived("arm=ur5 ee=plane"), LIBRARY)
-    small = default_name(derived("arm=ur5 ee=plane ee.size=80mm"), LIBRARY)
-    turned = default_name(derived("arm=ur5 ee=plane ee.mount_yaw=90deg"), LIBRARY)
-    assert plain == "ur5-plane"
-    assert small.startswith("ur5-plane-")
-    assert len({plain, small, turned}) == 3
+def test_different_robots_have_different_names_of_their_parts_and_a_mark_of_changed_parameters():
+    texts = ["arm=ur5 ee=plane", "arm=ur5 ee=plane ee.size=80mm", "base=gantry ee=plane"]
+    texts += ["arm=ur5 ee=plane ee.mount_yaw=90deg"]
+    texts += [f"arm=yumi {port}.ee=stick" for port in ("left", "right")]
+    texts += [f"base=pedestal {port}=stick" for port in ("left.ee", "right.ee", "ee")]
+    names = [default_name(derived(text), LIBRARY) for text in texts]
+    assert len(set(names)) == len(texts)
+    assert (names[0], names[2]) == ("ur5-plane", "gantry-plane")
+    assert names[1].startswith("ur5-plane-")
 
 
 @pytest.mark.parametrize(
@@ -351,14 +335,16 @@ def test_a_grammar_names_the_parameter_that_was_meant():
         parse_words(["arm3", "claw_size=1"], LIBRARY)
 
 
-def parts(links_grammar, *words):
-    tree = derive(pin(links_grammar, words, LIBRARY), LIBRARY, FirstChooser())
-    return [node.part for node in tree.walk()]
+def pinned_nodes(links_grammar, *words):
+    return derive(pin(links_grammar, words, LIBRARY), LIBRARY, FirstChooser()).walk()
 
 
-def values(links_grammar, *words):
-    tree = derive(pin(links_grammar, words, LIBRARY), LIBRARY, FirstChooser())
-    return {node.label: dict(node.parameters) for node in tree.walk()}
+def parts(*grammar_and_words):
+    return [node.part for node in pinned_nodes(*grammar_and_words)]
+
+
+def values(*grammar_and_words):
+    return {node.label: dict(node.parameters) for node in pinned_nodes(*grammar_and_words)}
 
 
 @pytest.fixture(scope="module")

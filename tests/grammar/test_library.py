@@ -53,9 +53,8 @@ def test_every_part_composes_into_a_robot_without_errors(name):
 def test_tool_frames_lie_in_front_of_the_mount_and_point_outwards(name):
     part = load_part(LIBRARY.manifest(name))
     T_root_link = forward_kinematics(part.fragment, part.fragment.home)
-    T_root_tool = (
-        T_root_link[part.fragment.link_index[part.tool.link]] @ part.tool.T_link_frame.matrix
-    )
+    T_root_tool_link = T_root_link[part.fragment.link_index[part.tool.link]]
+    T_root_tool = T_root_tool_link @ part.tool.T_link_frame.matrix
     T_mount_tool = part.T_root_mount.inverse().matrix @ T_root_tool
     assert T_mount_tool[:3, 2] == pytest.approx([0, 0, 1], abs=1e-3)
     beside, ahead = np.hypot(*T_mount_tool[:2, 3]), T_mount_tool[2, 3]

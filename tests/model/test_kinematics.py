@@ -236,9 +236,7 @@ def test_unwrapped_configurations_are_nearest_to_the_reference():
     apart = np.abs(unwrapped - start)
     assert (apart <= np.abs(ends - start) + 1e-9).all()
     others = [unwrapped + turn for turn in (-2 * np.pi, 2 * np.pi)]
-    nearer = [
-        (np.abs(each - start) < apart - 1e-9) & (lower <= each) & (each <= upper) for each in others
-    ]
+    nearer = [(abs(q - start) < apart - 1e-9) & (lower <= q) & (q <= upper) for q in others]
     assert not np.any(nearer)
     assert (apart < np.abs(ends - start) - 6).any()
 
@@ -312,9 +310,8 @@ def test_position_ik_reaches_goals_within_the_limits(index):
     left = goals - frame_pose(body, found)[:, :3, 3]
     np.testing.assert_allclose(error, left, atol=1e-9)
     assert np.median(np.linalg.norm(left, axis=1)) < 1e-3
-    idle = np.setdiff1d(
-        range(body.dof), driving_joints(body, body.joint_chain(body.frame("tool").link))
-    )
+    driven = driving_joints(body, body.joint_chain(body.frame("tool").link))
+    idle = np.setdiff1d(range(body.dof), driven)
     np.testing.assert_allclose(found[:, idle], q[:, idle], atol=1e-9)
     batch = Batch(*[index] * 6, dtype=torch.float64)
     padded = torch.ones_like(batch.home)
@@ -360,9 +357,8 @@ def test_poses_are_reached_from_random_starts_within_the_limits():
     random = torch.rand(2, *low.shape, generator=torch.Generator().manual_seed(0))
     goal_q = (low + (high - low) * random[0])[::starts].repeat_interleave(starts, 0)
     positions, rotations = solver.poses(goal_q)
-    q, error = solver.solve(
-        low + (high - low) * random[1], positions, rotations, rotation_weight=0.2, iterations=60
-    )
+    q = low + (high - low) * random[1]
+    q, error = solver.solve(q, positions, rotations, rotation_weight=0.2, iterations=60)
     assert ((low <= q) & (q <= high)).all()
     reached, turned = solver.poses(q)
     assert torch.allclose(error[:, :3], positions - reached, atol=1e-5)

@@ -207,9 +207,8 @@ def test_a_transformed_shape_has_the_transformed_inertia():
 
 def test_overlap_is_counted_once():
     half = Pose((0.05, 0.0, 0.0))
-    body = inertial_from_density(
-        [Shape(Box((0.1, 0.1, 0.1))), Shape(Box((0.1, 0.1, 0.1)), half)], DENSITY
-    )
+    box = Shape(Box((0.1, 0.1, 0.1)))
+    body = inertial_from_density([box, replace(box, T_link_shape=half)], DENSITY)
     whole = inertial_from_density([Shape(Box((0.15, 0.1, 0.1)), Pose((0.025, 0.0, 0.0)))], DENSITY)
     assert body.mass == pytest.approx(whole.mass)
     np.testing.assert_allclose(body.com, whole.com, atol=1e-12)
