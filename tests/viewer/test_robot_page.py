@@ -417,7 +417,8 @@ def test_toggles_draw_grown_shapes_names_boxes_and_the_workspace(viewer):
         view = nodes(on)
 
         def radius():
-            return np.linalg.norm(view["/robot/1/collision0"].vertices[:, :2], axis=1).max()
+            shape = view.get("/robot/1/collision0")  # not there while it is drawn again
+            return np.linalg.norm(shape.vertices[:, :2], axis=1).max() if shape else np.inf
 
         client.until(lambda: "/robot/workspace_slice" in view)
         client.shows("slice=0.05")
