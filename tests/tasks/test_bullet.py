@@ -57,7 +57,6 @@ def reset(simulation, q=None, pose=None, envs=None):
 
 
 def client_of(simulation, env=0):
-    """The PyBullet client of an environment."""
     return simulation.batch._loaded[env]
 
 

@@ -160,7 +160,6 @@ each_object = pytest.mark.parametrize("task", OBJECTS)
 
 @pytest.fixture(scope="module")
 def specs(cache):
-    """Specifications of the arm at each task."""
     return {task: draw_spec(robot(ROBOT), CONFIGS[task], cache=cache) for task in OBJECTS}
 
 

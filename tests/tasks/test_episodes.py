@@ -96,7 +96,6 @@ class StubSimulation:
 
 
 def stub_batch(specs, names, num_envs, *, first=0, **options):
-    """Return a batch whose physics are a stub."""
     chosen = [specs[name] for name in names]
     index = [(first + i) % len(chosen) for i in range(num_envs)]
     simulation = StubSimulation([chosen[i].scene for i in index])

@@ -536,7 +536,6 @@ def test_imports_register_the_ids_and_load_no_heavy_package(script):
 
 @pytest.fixture
 def made(opened):
-    """Make environments in MuJoCo that are closed after the test."""
     return lambda name=REACH, **options: opened(make(name, **{"sim": "mujoco", **options}))
 
 

@@ -48,7 +48,6 @@ def on(opened):
 
 @pytest.fixture
 def plain(opened):
-    """Create renderers of bare scenes."""
     return lambda scene: opened(
         Renderer(scene, (), np.array([scene.robot.home]), np.zeros((0, 3)), SIZE)
     )

@@ -76,13 +76,11 @@ def load_in(opened):
 
 @pytest.fixture
 def load(sim, load_in):
-    """Create simulations in the simulator of the test."""
     return partial(load_in, sim)
 
 
 @pytest.fixture
 def load_both(load_in):
-    """Create simulations in MuJoCo and in PyBullet."""
     return lambda *args, **options: [
         load_in(name, *args, **options) for name in ("mujoco", "pybullet")
     ]

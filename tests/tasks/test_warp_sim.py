@@ -46,7 +46,6 @@ def walks(scenes, joints, seed=0):
 
 @pytest.fixture(scope="module")
 def arms():
-    """Three robots of one structure with other numbers."""
     names = (f"arm=arm3 arm.length={length} ee=stick" for length in (0.25, 0.3, 0.35))
     return [Scene(robot(name), ground=None) for name in names]
 
