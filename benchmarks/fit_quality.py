@@ -49,7 +49,7 @@ from morphgen.files import write_atomic
 from morphgen.fitting.link_fit import FitOptions, fit_solid
 from morphgen.fitting.quality import quality
 from morphgen.fitting.solid import Solid, solid_of, solid_of_mesh
-from morphgen.formats.fits import shapes_key, shapes_to_fit
+from morphgen.formats.fits import shapes_key
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
 from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
@@ -158,12 +158,12 @@ def _print(found: Mapping[str, Sequence[Row]]) -> None:
 def link_tasks(only: set[str]) -> list[Task]:
     """Return the links with shapes of the named real arms, or of all real arms."""
     return [
-        Task(manifest.name, link.name, shapes_to_fit(link))
+        Task(manifest.name, link.name, link.solid_shapes)
         for manifest in default_library().manifests("arm")
         if not manifest.is_template and not manifest.scaling
         if not only or manifest.name in only
         for link in load_part(manifest).fragment.links
-        if shapes_to_fit(link)
+        if link.solid_shapes
     ]
 
 

@@ -25,7 +25,7 @@ from morphgen.errors import MorphgenError
 from morphgen.fitting.link_fit import FitOptions, fit_solid
 from morphgen.fitting.solid import solid_of
 from morphgen.formats.bundle import read_robot
-from morphgen.formats.fits import are_primitives, shapes_key, shapes_to_fit
+from morphgen.formats.fits import are_primitives, shapes_key
 from morphgen.model.geometry import Shape
 from morphgen.processes import parallel_map
 
@@ -85,7 +85,7 @@ def _links(words: list[str]) -> tuple[dict[str, tuple[Shape, ...]], list[str]]:
             refused.append(f"{path.name}: {str(error).removeprefix(str(path))}")
             continue
         for link in robot.links:
-            shapes = shapes_to_fit(link)
+            shapes = link.solid_shapes
             if not are_primitives(shapes) and (key := shapes_key(shapes)) not in seen:
                 seen.add(key)
                 found[f"{path.stem}:{link.name}"] = shapes

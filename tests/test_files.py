@@ -28,14 +28,15 @@ from morphgen.grammar.request import parse_request
 from morphgen.model import inertia, mesh_files
 from morphgen.model import mesh as mesh_module
 from morphgen.model.geometry import Box, Mesh, MeshContent, MeshPart, Pose, Shape
-from morphgen.model.mesh import convex_hull, load_mesh, mesh_parts, mesh_triangles
+from morphgen.model.mesh import convex_hull, hull_triangles, load_mesh, mesh_parts, mesh_triangles
 from morphgen.model.robot import Link, Robot
 
 TYPES = (Robot, Link, Shape, Pose, Box, Mesh, MeshContent, MeshPart)
 MEMORIES = (
     *(composing._ignored_in_part, part_module._load, xacro_compile._compiled),
     *(inertia._bounding_box, inertia._union_moments, inertia._unit_solid),
-    *(mesh_module._content_or_fault, mesh_module._hull, mesh_module._loaded, mesh_module._scaled),
+    mesh_module._content_or_fault,
+    *(read.__wrapped__ for read in (convex_hull, hull_triangles, load_mesh, mesh_triangles)),
 )
 """Caches in memory of what is kept in files, too."""
 

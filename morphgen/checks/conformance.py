@@ -39,7 +39,7 @@ from morphgen.model.kinematics import (
     movable_positions,
     random_configurations,
 )
-from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, TOOL, Frame, Joint, Mimic, Robot
+from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Frame, Joint, Mimic, Robot
 from morphgen.typing import Array
 
 POSITION_TOLERANCE = 1e-5  # largest accepted distance between a loader's tool and morphgen's [m]
@@ -139,17 +139,15 @@ def compare(robot: Robot, folder: Path, samples: int = 100, seed: int = 0) -> Co
     """Compare a robot with its files in a folder of morphgen's own or a ``loader_copy``."""
     samples = whole_number("samples", samples, FormatError, 1)
     seed = whole_number("seed", seed, FormatError, 0)
-    frame = next((frame for frame in robot.frames if frame.name == TOOL), None)
+    frame = robot.tool
     if frame is None:
         frame = Frame(robot.links[-1].name, robot.links[-1].name)
         robot = replace(robot, frames=(frame,))
     q = _configurations(robot, samples, seed)
-    rows = []
-    for loader in LOADERS:
-        row, _ = _row(loader, robot, folder, frame.name, q, has_gains=True)
-        rows.append(row)
+    read = (_row(loader, robot, folder, frame.name, q, has_gains=True) for loader in LOADERS)
+    rows = tuple(row for row, _ in read)
     passed = all(row.passed is not False for row in rows)
-    return ConformanceReport(robot.name, frame.name, samples, seed, passed, tuple(rows))
+    return ConformanceReport(robot.name, frame.name, samples, seed, passed, rows)
 
 
 def compare_file(

@@ -108,7 +108,7 @@ def check_inertia(robot: Robot) -> Iterator[Finding]:
                 texts = (", ".join(f"{1000 * r:.3g}" for r in each) for each in (radii, expected))
                 values = dict(zip(("radii", "expected"), texts, strict=True))
                 yield found("inertia-implausible", where, **values)
-        low, high = bounding_box(link.collisions or link.visuals)
+        low, high = bounding_box(link.solid_shapes)
         margin = COM_MARGIN * (high - low) / 2
         if np.any(inertial.com < low - margin) or np.any(inertial.com > high + margin):
             ends = " to ".join(f"({', '.join(f'{v:.3g}' for v in each)})" for each in (low, high))
@@ -147,7 +147,7 @@ def _unit_density_inertial(link: Link) -> Inertial | None:
 
     Return None if there are no shapes, if one is invalid, or if all are flat.
     """
-    shapes = link.collisions or link.visuals
+    shapes = link.solid_shapes
     if not shapes or not all(has_hull(shape.geometry) for shape in shapes):
         return None
     solid = inertial_from_density(shapes, density=1.0)
@@ -603,13 +603,12 @@ def check_names(robot: Robot) -> Iterator[Finding]:
 
 def check_tool(robot: Robot) -> Iterator[Finding]:
     """Find a robot without a tool frame, or with one that no joint moves."""
-    tool = next((frame for frame in robot.frames if frame.name == TOOL), None)
-    if tool is None:
+    if robot.tool is None:
         yield found("tool-missing", f"robot {robot.name}")
-    elif robot.dof > 0 and not any(
-        robot.joints[k].is_movable for k in robot.joint_chain(tool.link)
-    ):
-        yield found("tool-still", f"frame {TOOL}", link=tool.link)
+        return
+    chain = robot.joint_chain(robot.tool.link)
+    if robot.dof > 0 and not any(robot.joints[k].is_movable for k in chain):
+        yield found("tool-still", f"frame {TOOL}", link=robot.tool.link)
 
 
 def check_loaders(robot: Robot) -> Iterator[Finding]:

@@ -160,8 +160,6 @@ def survey_collisions(
     *,
     known_pairs: Iterable[Pair] = (),
     should_test: Callable[[str, str], bool] | None = None,
-    samples: int = SAMPLES,
-    seed: int = 0,
 ) -> CollisionSurvey:
     """Find pairs of links whose contact is no self-collision: adjacent, at home, nearly always.
 
@@ -179,7 +177,7 @@ def survey_collisions(
     ignore.update(home_penetrations)
     remaining = {pair for pair in remaining - ignore if should_test is None or should_test(*pair)}
     if remaining and robot.dof:
-        q = random_configurations(robot, samples, np.random.default_rng(seed))
+        q = random_configurations(robot, SAMPLES, np.random.default_rng(0))
         ignore.update(_always_penetrating(checker, q, remaining))
     return CollisionSurvey(tuple(sorted(ignore)), home_penetrations)
 

@@ -25,7 +25,7 @@ from morphgen.errors import FitError
 from morphgen.fitting.link_fit import FitOptions
 from morphgen.fitting.replace_collision import with_fits, with_primitives
 from morphgen.fitting.robot_fit import FitReport, fit_links, fits_of
-from morphgen.formats.fits import read_stored_fits, shapes_to_fit
+from morphgen.formats.fits import read_stored_fits
 from morphgen.model.geometry import Shape
 from morphgen.model.inertia import link_frame_mesh
 from morphgen.model.kinematics import forward_kinematics, random_configurations
@@ -155,7 +155,7 @@ def fit_robot(
     jobs: int = 1,
 ) -> FittedRobot:
     """Fit primitives to a robot's links; ``visual``: they replace the visual shapes, too."""
-    if not any(map(shapes_to_fit, robot.links)):
+    if not any(link.solid_shapes for link in robot.links):
         raise FitError(f"robot {robot.name!r}: no link has a shape")
     report = fit_links(robot, options, jobs=jobs)
     return FittedRobot(robot, report, folders, visual)

@@ -92,7 +92,6 @@ def as_spheres(
     *,
     spheres: int = SPHERES,
     cover: float | None = None,
-    jobs: int = 1,
 ) -> Robot:
     """Return the robot with spheres as its collision shapes, from the user's cache or a new fit.
 
@@ -107,7 +106,7 @@ def as_spheres(
     kind = f"{_SPHERE_CACHE}-{spheres}" + (f"-{cover!r}" if cover is not None else "")
     fits = _cached_fits(others, kind)
     if missing := [link for link in others if link.name not in fits]:
-        fits |= _fit_and_keep(robot, missing, options, kind, stored, jobs=jobs)
+        fits |= _fit_and_keep(robot, missing, options, kind, stored)
     for link in links:
         if has_only_spheres(link.collisions) and (fit := find_fit(link.collisions, robot, stored)):
             fits[link.name] = fit
@@ -168,8 +167,6 @@ def _fit_and_keep(
     options: FitOptions,
     kind: str,
     stored: StoredFits,
-    *,
-    jobs: int = 1,
 ) -> dict[str, StoredFit]:
     """Fit links with collision shapes, say so, keep the fits in the cache, and return them."""
     from morphgen.fitting.robot_fit import fit_links, fits_of  # needs the extra fit
@@ -177,8 +174,7 @@ def _fit_and_keep(
     _LOGGER.warning(
         "fitting primitives to %d links of robot %r; the fits are kept", len(links), robot.name
     )
-    names = [link.name for link in links]
-    report = fit_links(robot, options, only=names, jobs=jobs)
+    report = fit_links(robot, options, only=[link.name for link in links])
     for finding in report.findings:
         if finding.severity != "info":
             raise FitError(f"{finding.where}: {finding.why}")

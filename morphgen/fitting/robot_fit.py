@@ -236,19 +236,17 @@ def fit_links(
     solids: dict[str, Solid] = {}
     failures: dict[str, FitError] = {}
     links = [
-        link
-        for link in robot.links
-        if fit_files.shapes_to_fit(link) and (only is None or link.name in only)
+        link for link in robot.links if link.solid_shapes and (only is None or link.name in only)
     ]
     for link in links:
         try:
-            solids[link.name] = solid_of(fit_files.shapes_to_fit(link))
+            solids[link.name] = solid_of(link.solid_shapes)
         except FitError as error:
             failures[link.name] = error
     solid_links = [link for link in links if link.name in solids]
     shared = representatives([solids[link.name].mesh for link in solid_links])
     unique = [link for i, link in enumerate(solid_links) if shared[i][0] == i]
-    inputs = [(fit_files.shapes_to_fit(link), solids[link.name]) for link in unique]
+    inputs = [(link.solid_shapes, solids[link.name]) for link in unique]
     # A fit takes seconds: one item a worker at a time.
     attempts = parallel_map(partial(_try_fit, options), inputs, jobs, chunk=1)
     fits = {link.name: fit for link, fit in zip(unique, attempts, strict=True)}
@@ -299,8 +297,8 @@ def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manife
 
 
 def _mesh_keys(manifest: Manifest) -> set[str]:
-    links = (fit_files.shapes_to_fit(link) for link in load_part(manifest).fragment.links)
-    return {fit_files.shapes_key(shapes) for shapes in links if fit_files.has_meshes(shapes)}
+    shapes = (link.solid_shapes for link in load_part(manifest).fragment.links)
+    return {fit_files.shapes_key(each) for each in shapes if fit_files.has_meshes(each)}
 
 
 def store_parts(manifests: Sequence[Manifest], *, jobs: int = 1) -> Iterator[Path]:
@@ -313,7 +311,7 @@ def store_part(manifest: Manifest) -> Path:
     fragment = load_part(manifest).fragment
     fits = {}
     for report in fit_links(fragment, COLLISION_OPTIONS).links:
-        shapes = fit_files.shapes_to_fit(fragment.link(report.link))
+        shapes = fragment.link(report.link).solid_shapes
         fit = _with_token(report.link, shapes, report.fit)
         fits[fit_files.shapes_key(shapes)] = fit.scaled(1 / fit_files.shapes_scale(shapes))
     path = manifest.path.with_name(manifest.path.stem + fit_files.SUFFIX)
@@ -325,7 +323,7 @@ def fits_of(robot: Robot, report: FitReport, stored: StoredFits) -> dict[str, St
     """Return a report's fits by link, each with the link's token, by preference the known one."""
     fits = {}
     for row in report.links:
-        shapes = fit_files.shapes_to_fit(robot.link(row.link))
+        shapes = robot.link(row.link).solid_shapes
         if known := fit_files.find_fit(shapes, robot, stored):
             fits[row.link] = replace(
                 known, collision=row.fit.primitives, collision_iou=row.fit.quality.iou

@@ -213,16 +213,12 @@ def write_meshes(robot: Robot, folder: Path) -> dict[Mesh, str]:
 
     Return their files, such as ``meshes/hand-1a2b3c4d.stl``: relative to the parent of ``folder``.
     """
-    files: dict[Mesh, str] = {}
-    for link in robot.links:
-        for shape in (*link.visuals, *link.collisions):
-            mesh = shape.geometry
-            if not isinstance(mesh, Mesh) or mesh in files:
-                continue
-            folder.mkdir(exist_ok=True)
-            name, data = mesh_file(mesh)
-            (folder / name).write_bytes(data)
-            files[mesh] = f"{MESHES}/{name}"
+    files = {}
+    for mesh in robot.meshes:
+        folder.mkdir(exist_ok=True)
+        name, data = mesh_file(mesh)
+        (folder / name).write_bytes(data)
+        files[mesh] = f"{MESHES}/{name}"
     return files
 
 
@@ -303,7 +299,6 @@ def robot_card(
 
     It contains no time and no path, so that the same robot gives the same bytes on any machine.
     """
-    has_tool = any(frame.name == "tool" for frame in robot.frames)
     joints = [robot.joints[k] for k in robot.independent_joints]
     return {
         "format": CARD_FORMAT,
@@ -312,7 +307,7 @@ def robot_card(
         "movable": len(robot.movable_joints),
         "dof": robot.dof,
         "mass": round_number(robot.mass),
-        "reach": round_number(arm_reach(robot)) if has_tool and robot.dof else None,
+        "reach": round_number(arm_reach(robot)) if robot.tool and robot.dof else None,
         "home": {joint.name: round_number(q) for joint, q in zip(joints, robot.home, strict=True)},
         "frames": {
             frame.name: {

@@ -59,9 +59,7 @@ def read_installed(package: str, file: str, args: Mapping[str, str]) -> Robot:
         return read()
     key = (path, finder.roots, dict(args))
     robot = kept_reading("robot", key, read, (*_ROBOT, *_GEOMETRIES))
-    shapes = (shape for link in robot.links for shape in (*link.visuals, *link.collisions))
-    meshes = (shape.geometry for shape in shapes if isinstance(shape.geometry, Mesh))
-    return robot if all(mesh.path.is_file() for mesh in meshes) else read()
+    return robot if all(mesh.path.is_file() for mesh in robot.meshes) else read()
 
 
 def is_mjcf(path: Path) -> bool:

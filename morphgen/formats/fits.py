@@ -36,7 +36,7 @@ from morphgen.model.geometry import (
     dimensions,
     scale_shape,
 )
-from morphgen.model.robot import Link, Robot
+from morphgen.model.robot import Robot
 
 SUFFIX = ".primitives.json"  # suffix of the file of fits beside a part's manifest
 FITS = "primitives.json"  # name of the file of fits in a bundle
@@ -143,11 +143,6 @@ def has_meshes(shapes: Iterable[Shape]) -> bool:
 def are_primitives(shapes: Iterable[Shape]) -> bool:
     """Return whether all shapes are boxes, cylinders and spheres."""
     return all(isinstance(shape.geometry, Box | Cylinder | Sphere) for shape in shapes)
-
-
-def shapes_to_fit(link: Link) -> tuple[Shape, ...]:
-    """Return the shapes that primitives are fitted to: collision shapes, else visuals."""
-    return link.collisions or link.visuals
 
 
 def read_stored_fits(folders: Iterable[Path]) -> dict[str, StoredFit]:

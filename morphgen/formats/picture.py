@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
 from PIL import Image
 
 from morphgen.errors import MissingDependencyError
@@ -38,19 +37,16 @@ class GlContext(Protocol):
         """Release the context."""
 
 
-def render(
-    robot: Robot, mjcf: Path, q: ArrayLike | None = None, size: tuple[int, int] = SIZE
-) -> Image.Image:
-    """Draw a robot at q (dof,), by default at home, with MuJoCo's renderer; size in pixels."""
+def render(robot: Robot, mjcf: Path, size: tuple[int, int] = SIZE) -> Image.Image:
+    """Draw a robot at home with MuJoCo's renderer; size in pixels."""
     import mujoco
 
     log_mujoco_warnings()
-    q = np.asarray(robot.home if q is None else q, dtype=np.float64)
-    target, distance = _framing(robot, q, size[0] / size[1])
+    target, distance = _framing(robot, size[0] / size[1])
     model = mujoco.MjModel.from_xml_path(str(mjcf))
     mujoco.mj_clearCache(mujoco.mj_getCache())  # up to 500 MB of meshes by paths, mostly new ones
     data = mujoco.MjData(model)
-    for k, position in zip(robot.movable_joints, movable_positions(robot, q), strict=True):
+    for k, position in zip(robot.movable_joints, movable_positions(robot, robot.home), strict=True):
         data.qpos[model.joint(robot.joints[k].name).qposadr[0]] = position
     mujoco.mj_forward(model, data)
     model.vis.global_.fovy = _FOV
@@ -82,9 +78,9 @@ def render(
     return Image.fromarray(pixels[::-1])  # OpenGL's rows begin at the bottom
 
 
-def _framing(robot: Robot, q: Array, aspect: float) -> tuple[Array, float]:
+def _framing(robot: Robot, aspect: float) -> tuple[Array, float]:
     """Return centre (3,) and distance [m] of the closest view of the whole robot and its origin."""
-    T_root_link = forward_kinematics(robot, q)
+    T_root_link = forward_kinematics(robot, robot.home)
     points = [np.zeros((1, 3))]
     for T, link in zip(T_root_link, robot.links, strict=True):
         if link.visuals or link.collisions:

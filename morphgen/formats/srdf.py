@@ -29,7 +29,7 @@ class LinkSpheres(NamedTuple):
 
 def require_tool(robot: Robot) -> None:
     """Require that a robot has the frame ``tool``, which an SRDF and planners need."""
-    if all(frame.name != TOOL for frame in robot.frames):
+    if robot.tool is None:
         raise FormatError(
             f"robot {robot.name!r} has no frame {TOOL!r}, where its arm ends; import it with a "
             "tool (morphgen import FILE --tool LINK)"

@@ -281,12 +281,12 @@ def part_manifest(
             f"name {robot.name!r} of a part: morphgen has a part of this name; import its file "
             "alone, and choose another by --name"
         )
-    if all(frame.name != TOOL for frame in robot.frames):
+    tool = robot.tool
+    if tool is None:
         raise CompositionError(
             f"robot {robot.name!r} has no frame {TOOL!r}, which is the flange or the tool of a "
             "part; name its link by --tool"
         )
-    tool = robot.frame(TOOL)
     pose = tool.T_link_frame
     # Adding zero turns -0.0 into 0.0.
     xyz, rpy = ([value + 0.0 for value in values] for values in (pose.position, pose.rpy))

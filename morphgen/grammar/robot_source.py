@@ -253,7 +253,7 @@ def import_robot(
 
 def _has_tool_link(robot: Robot) -> bool:
     """Return whether a robot has a link ``tool`` and no such frame."""
-    return TOOL in robot.link_index and all(frame.name != TOOL for frame in robot.frames)
+    return TOOL in robot.link_index and robot.tool is None
 
 
 def _with_tool(robot: Robot, link: str) -> Robot:

@@ -13,7 +13,7 @@ from morphgen.grammar.manifest import UNITS
 from morphgen.grammar.syntax import Expression, parse_condition, unknown
 from morphgen.model.inertia import bounding_box, box_corners
 from morphgen.model.kinematics import forward_kinematics, reach
-from morphgen.model.robot import TOOL, Robot
+from morphgen.model.robot import Robot
 
 
 @dataclass(frozen=True)
@@ -227,15 +227,13 @@ class RobotProperties:
     @cached_property
     def reach(self) -> float:
         """Largest distance of the tool from the root's origin [m]; 0 without a tool."""
-        robot = self._robot
-        return reach(robot) if any(frame.name == TOOL for frame in robot.frames) else 0.0
+        return reach(self._robot) if self._robot.tool else 0.0
 
     @cached_property
     def movable_to_tool(self) -> float:
         """Number of movable joints between the root and the tool; 0 without a tool."""
         robot = self._robot
-        link = next((frame.link for frame in robot.frames if frame.name == TOOL), None)
-        chain = [] if link is None else robot.joint_chain(link)
+        chain = robot.joint_chain(robot.tool.link) if robot.tool else ()
         return sum(robot.joints[k].is_movable for k in chain)
 
     @cached_property
@@ -245,7 +243,7 @@ class RobotProperties:
         T_root_link = forward_kinematics(robot, robot.home)
         top = 0.0
         for T, link in zip(T_root_link, robot.links, strict=True):
-            if shapes := link.collisions or link.visuals:
+            if shapes := link.solid_shapes:
                 corners = box_corners(*bounding_box(shapes)).T
                 top = max(top, float((T[2, :3] @ corners + T[2, 3]).max()))
         return top

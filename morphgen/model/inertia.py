@@ -59,13 +59,13 @@ def inertial_from_density(shapes: Sequence[Shape], density: float) -> Inertial:
 
 def with_inertia(link: Link, density: float) -> Link:
     """Return the link with the mass properties of its collision shapes, else visuals, if any."""
-    shapes = link.collisions or link.visuals
+    shapes = link.solid_shapes
     return replace(link, inertial=inertial_from_density(shapes, density)) if shapes else link
 
 
 def inertial_from_mass(link: Link, mass: float) -> Inertial:
     """Return the mass properties of a link's shapes with uniform density and a given mass [kg]."""
-    unit = inertial_from_density(link.collisions or link.visuals, 1.0)
+    unit = inertial_from_density(link.solid_shapes, 1.0)
     if unit.mass <= 0:
         raise RobotError(f"link {link.name!r} has no volume to give {mass:g} kg an inertia")
     return Inertial.from_matrix(mass, unit.com, unit.matrix * (mass / unit.mass))

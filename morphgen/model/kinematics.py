@@ -354,19 +354,12 @@ def dls_step(J: Array, error: Array, damping: float) -> Array:
 
 
 def solve_position_ik(
-    robot: Robot,
-    q: Array,
-    positions: Array,
-    *,
-    iterations: int = 25,
-    damping: float = DAMPING,
-    max_step: float = MAX_STEP,
-    tolerance: float = 0.0,
+    robot: Robot, q: Array, positions: Array, *, iterations: int = 25, tolerance: float = 0.0
 ) -> tuple[Array, Array]:
     """Move tools from q (n, dof) to positions (n, 3) in the root frame by damped least squares.
 
-    Return configurations within the joint limits and the remaining errors (n, 3) [m]. ``max_step``
-    bounds the change of a joint in one iteration; a tool within ``tolerance`` [m] has arrived.
+    Return configurations within the joint limits and the remaining errors (n, 3) [m]. A tool within
+    ``tolerance`` [m] has arrived.
     """
     low, high = joint_limits(robot).T
     q = np.clip(q, low, high)
@@ -379,20 +372,15 @@ def solve_position_ik(
             rows, error, J_root_tool = rows[away], error[away], J_root_tool[away]
             if not len(rows):
                 break
-        step = dls_step(J_root_tool[:, :3], error, damping)
-        q[rows] = np.clip(q[rows] + np.clip(step, -max_step, max_step), low, high)
+        step = dls_step(J_root_tool[:, :3], error, DAMPING)
+        q[rows] = np.clip(q[rows] + np.clip(step, -MAX_STEP, MAX_STEP), low, high)
     return q, positions - frame_pose(robot, q)[:, :3, 3]
 
 
 def solve_pose_ik(
-    robot: Robot,
-    T_root_goal: Array,
-    q: ArrayLike,
-    *,
-    rotation_weight: float = 0.2,
-    frame: str = TOOL,
+    robot: Robot, T_root_goal: Array, q: ArrayLike, *, rotation_weight: float = 0.2
 ) -> Array:
-    """Move a frame to a pose, or as near as possible, by damped least squares within joint limits.
+    """Move the tool to a pose, or as near as possible, by damped least squares within joint limits.
 
     Joints at a limit that a step would move beyond it are excluded from the step. The weight of the
     rotation error is in m/rad; 0 leaves the orientation free.
@@ -404,9 +392,9 @@ def solve_pose_ik(
     least = np.inf
     weights = np.repeat([1.0, rotation_weight], 3)
     for _ in range(POSE_ITERATIONS):
-        T_root_frame, J = frame_jacobian(robot, current, frame)
-        R_error = T_root_goal[:3, :3] @ T_root_frame[:3, :3].T
-        position_error = T_root_goal[:3, 3] - T_root_frame[:3, 3]
+        T_root_tool, J = frame_jacobian(robot, current)
+        R_error = T_root_goal[:3, :3] @ T_root_tool[:3, :3].T
+        position_error = T_root_goal[:3, 3] - T_root_tool[:3, 3]
         rotation_error = Rotation.from_matrix(R_error).as_rotvec()
         error = np.concatenate([position_error, rotation_error]) * weights
         norm = float(np.linalg.norm(error))
@@ -419,7 +407,7 @@ def solve_pose_ik(
         weighted = np.where(blocked, 0.0, J * weights[:, None])
         damping = DAMPING * max(float(np.linalg.norm(weighted, 2)), 1e-9)
         step = dls_step(weighted, error, damping)
-        # Scale all joints equally, so that the frame keeps its direction of motion.
+        # Scale all joints equally, so that the tool keeps its direction of motion.
         scale = min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-9))
         current = np.clip(current + step * scale, low, high)
     return best

@@ -214,14 +214,10 @@ def compile_tree(
 
 
 def compile_chain(
-    robots: Sequence[Robot],
-    frame: str = TOOL,
-    *,
-    dtype: torch.dtype = torch.float32,
-    device: Device = "cpu",
+    robots: Sequence[Robot], *, dtype: torch.dtype = torch.float32, device: Device = "cpu"
 ) -> FrameChain:
-    """Compile robots for ``frame_jacobian``, ``frame_pose`` and ``FramePositions``."""
-    rows, ends = zip(*(moving_chain(robot, frame) for robot in robots), strict=True)
+    """Compile the tools of robots for ``frame_jacobian``, ``frame_pose``, ``FramePositions``."""
+    rows, ends = zip(*(moving_chain(robot, TOOL) for robot in robots), strict=True)
     depth = max(1, *map(len, rows))
     joints = _joint_tensors(robots, rows, depth, dtype, device, pad_front=True)
     return FrameChain(joints, torch.from_numpy(np.array(ends)).to(device, dtype))

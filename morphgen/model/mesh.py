@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -46,18 +46,37 @@ class Triangles(NamedTuple):
     faces: NDArray[np.int64]  # shape (m, 3)
 
 
+def _until_changed(function: Callable[[Mesh], T]) -> Callable[[Mesh], T]:
+    """Cache the results of a function of a mesh; a file that changed is read again."""
+
+    @lru_cache(maxsize=512)
+    @wraps(function)
+    def cached(mesh: Mesh, _stamp: tuple[int, int]) -> T:
+        return function(mesh)
+
+    @wraps(cached)
+    def call(mesh: Mesh) -> T:
+        return cached(replace(mesh, path=mesh.path.absolute()), _stamp(mesh.path))
+
+    return call
+
+
+@_until_changed
 def load_mesh(mesh: Mesh) -> trimesh.Trimesh:
     """Return the triangles of a mesh as an object of trimesh; see ``mesh_triangles``."""
-    return _loaded(replace(mesh, path=mesh.path.absolute()), _stamp(mesh.path), hull=False)
+    import trimesh  # here and below, because commands that change no mesh should start quickly
+
+    return trimesh.Trimesh(*mesh_triangles(mesh), process=False)
 
 
+@_until_changed
 def mesh_triangles(mesh: Mesh) -> Triangles:
     """Return the triangles of a mesh in the frame of its URDF ``<mesh>`` [m], scale applied.
 
     Coincident vertices are merged, triangles without area are removed, and a mirroring scale keeps
     the normals pointing outwards. The result is cached until the file changes.
     """
-    return _scaled(replace(mesh, path=mesh.path.absolute()), _stamp(mesh.path))
+    return kept_of_mesh("triangles", mesh, lambda: _make_scaled(mesh), Triangles)
 
 
 def mesh_parts(path: Path) -> tuple[MeshPart, ...]:
@@ -74,9 +93,7 @@ def require_bounded_files(paths: Iterable[Path], origin: str) -> None:
 def require_bounded_meshes(robot: Robot) -> None:
     """Require few enough triangles and pixels, read until there are too many."""
     origin, faces, pixels = f"robot {robot.name!r}", 0, 0
-    shapes = (shape for link in robot.links for shape in (*link.visuals, *link.collisions))
-    meshes = (shape.geometry for shape in shapes if isinstance(shape.geometry, Mesh))
-    for path in dict.fromkeys(mesh.path for mesh in meshes):
+    for path in dict.fromkeys(mesh.path for mesh in robot.meshes):
         with suppress(MeshError):
             content = _content(path)
             faces += sum(len(part.faces) for part in content.parts)
@@ -98,14 +115,28 @@ def left_out(path: Path) -> tuple[str, ...]:
     return _content(path).left_out
 
 
+@_until_changed
 def convex_hull(mesh: Mesh) -> trimesh.Trimesh:
     """Return the convex hull of a mesh as an object of trimesh; see ``hull_triangles``."""
-    return _loaded(replace(mesh, path=mesh.path.absolute()), _stamp(mesh.path), hull=True)
+    import trimesh
+
+    return trimesh.Trimesh(*hull_triangles(mesh), process=False)
 
 
+@_until_changed
 def hull_triangles(mesh: Mesh) -> Triangles:
     """Return the triangles of the convex hull of a mesh [m]; cached until the file changes."""
-    return _hull(replace(mesh, path=mesh.path.absolute()), _stamp(mesh.path))
+
+    def make() -> Triangles:
+        import trimesh
+
+        vertices = mesh_triangles(mesh).vertices
+        if is_flat(vertices):
+            raise MeshError(f"{mesh.path}: is flat, so it has no convex hull")
+        hull: trimesh.Trimesh = trimesh.convex.convex_hull(vertices)
+        return Triangles(np.array(hull.vertices), np.array(hull.faces))
+
+    return kept_of_mesh("hull", mesh, make, Triangles)
 
 
 def is_flat(points: Array) -> bool:
@@ -140,33 +171,6 @@ def mesh_key(mesh: Mesh) -> tuple[object, ...] | None:
     if not path.is_file() or path.stat().st_size > MAX_ROBOT_BYTES:  # a pipe may never end
         return None
     return (content_sha256(path), path.suffix.lower(), mesh.scale, mesh.part)
-
-
-@lru_cache(maxsize=512)
-def _loaded(mesh: Mesh, stamp: tuple[int, int], *, hull: bool) -> trimesh.Trimesh:
-    import trimesh  # here and below, because commands that change no mesh should start quickly
-
-    triangles = _hull(mesh, stamp) if hull else _scaled(mesh, stamp)
-    return trimesh.Trimesh(*triangles, process=False)
-
-
-@lru_cache(maxsize=512)
-def _hull(mesh: Mesh, stamp: tuple[int, int]) -> Triangles:
-    def make() -> Triangles:
-        import trimesh
-
-        vertices = _scaled(mesh, stamp).vertices
-        if is_flat(vertices):
-            raise MeshError(f"{mesh.path}: is flat, so it has no convex hull")
-        hull: trimesh.Trimesh = trimesh.convex.convex_hull(vertices)
-        return Triangles(np.array(hull.vertices), np.array(hull.faces))
-
-    return kept_of_mesh("hull", mesh, make, Triangles)
-
-
-@lru_cache(maxsize=512)
-def _scaled(mesh: Mesh, _stamp: tuple[int, int]) -> Triangles:
-    return kept_of_mesh("triangles", mesh, lambda: _make_scaled(mesh), Triangles)
 
 
 def _make_scaled(mesh: Mesh) -> Triangles:

@@ -13,7 +13,7 @@ import numpy as np
 
 from morphgen.errors import RobotError, nearest
 from morphgen.model.findings import Finding
-from morphgen.model.geometry import IDENTITY, Pose, Shape, StoredFits
+from morphgen.model.geometry import IDENTITY, Mesh, Pose, Shape, StoredFits
 from morphgen.model.rotation import Vec3
 from morphgen.typing import Array
 
@@ -70,6 +70,11 @@ class Link:
             and not self.collisions
             and (self.inertial is None or self.inertial.mass == 0.0)
         )
+
+    @property
+    def solid_shapes(self) -> tuple[Shape, ...]:
+        """The shapes that the link fills: its collision shapes, or without any its visual ones."""
+        return self.collisions or self.visuals
 
 
 @dataclass(frozen=True)
@@ -326,6 +331,18 @@ class Robot:
     def root(self) -> Link:
         """The link at the base of the tree."""
         return self.links[0]
+
+    @property
+    def tool(self) -> Frame | None:
+        """The frame at the working point; None without one."""
+        return next((frame for frame in self.frames if frame.name == TOOL), None)
+
+    @property
+    def meshes(self) -> tuple[Mesh, ...]:
+        """All meshes, each once, in the order of the links, those of visual shapes first."""
+        shapes = (shape for link in self.links for shape in (*link.visuals, *link.collisions))
+        geometries = dict.fromkeys(shape.geometry for shape in shapes)
+        return tuple(geometry for geometry in geometries if isinstance(geometry, Mesh))
 
     def link(self, name: str) -> Link:
         """Return a link by name.

@@ -31,7 +31,7 @@ from morphgen.fitting.robot_fit import (
 from morphgen.fitting.solid import solid_of
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import read_bundle, write_bundle
-from morphgen.formats.fits import SUFFIX, read_stored_fits, shapes_key, shapes_to_fit
+from morphgen.formats.fits import SUFFIX, read_stored_fits, shapes_key
 from morphgen.formats.rounding import as_written
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
@@ -280,7 +280,7 @@ def test_new_fits_reach_stored_ones_or_their_target_with_as_few_primitives(name,
     body = load_part(LIBRARY.manifest(name)).fragment
     stored = read_stored_fits(LIBRARY.folders)
     for row in fit_links(body, options, only=only).links:
-        shapes = shapes_to_fit(body.link(row.link))
+        shapes = body.link(row.link).solid_shapes
         fit, new = stored[shapes_key(shapes)], row.fit.quality.iou
         kept = (fit.token,) if options == TOKEN_OPTIONS else fit.collision
         iou = quality(solid_of(shapes), kept).iou
