@@ -39,7 +39,7 @@ from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import MorphgenError, SimulationError
 from morphgen.formats.bundle import split_colours
 from morphgen.formats.urdf.write import urdf_text
-from morphgen.formats.zip_files import read_all
+from morphgen.formats.zip_files import read_npz
 from morphgen.model.geometry import Mesh, Pose
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import Robot
@@ -200,7 +200,7 @@ def episode_bytes(episode: Episode) -> bytes:
 def read_episode(path: Path, files: FileAccess) -> Episode:
     """Read an episode's file with its robots."""
     try:
-        arrays = read_all(path)
+        arrays = read_npz(path)
         data = json.loads(str(arrays["about"]))
         if data["format"] != FORMAT or data["task"] not in TASKS:
             raise ValueError(f"format {data['format']}, task {data['task']!r}")

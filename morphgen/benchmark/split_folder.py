@@ -140,7 +140,7 @@ def read_records(path: Path) -> list[Record]:
 def read_tokens(path: Path) -> tuple[list[str], NDArray[np.float64], NDArray[np.bool_]]:
     """Read names, tokens and mask of ``tokens.npz``."""
     try:
-        names, tokens, mask = read_npz(path, ("names", "tokens", "mask"))
+        names, tokens, mask = read_npz(path, ("names", "tokens", "mask")).values()
     except FileNotFoundError as error:
         raise BenchmarkError(f"{path}: no such file") from error
     except ValueError as error:

@@ -29,6 +29,7 @@ from morphgen.formats.bundle import URDF, read_bundle
 from morphgen.formats.description import read_description
 from morphgen.formats.gate import loader_copy
 from morphgen.formats.resolve import PackageFinder, default_finder
+from morphgen.formats.rounding import INERTIA_NAMES
 from morphgen.formats.urdf.read import robot_from_xml
 from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS
 from morphgen.model.dynamics import actuation, gravity_load, mass_matrix
@@ -466,7 +467,6 @@ def _differing(
     return tuple(quirk.words for quirk in chosen)
 
 
-_INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 Change = Callable[[etree._Element, Path], None]
 """Function of the root of a URDF, which it changes to what a loader reads, and of the file."""
 
@@ -542,7 +542,7 @@ def _set_inertial(
     etree.SubElement(element, "origin", xyz=" ".join(map(repr, com)))
     etree.SubElement(element, "mass", value=repr(mass))
     values = inertia[np.triu_indices(3)].tolist()
-    etree.SubElement(element, "inertia", dict(zip(_INERTIA, map(repr, values), strict=True)))
+    etree.SubElement(element, "inertia", dict(zip(INERTIA_NAMES, map(repr, values), strict=True)))
 
 
 @_quirk("joins the base to the world, without its mass", "mujoco (urdf)")
@@ -569,10 +569,10 @@ def _set_inertias(
 ) -> None:
     """Set the moments of inertia that are wrong; they are tested in ascending order."""
     for inertia in root.iterfind("link/inertial/inertia"):
-        xx, xy, xz, yy, yz, zz = (float(inertia.get(name) or 0) for name in _INERTIA)
+        xx, xy, xz, yy, yz, zz = (float(inertia.get(name) or 0) for name in INERTIA_NAMES)
         a, b, c = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).tolist()
         if is_wrong(a, b, c):
-            for name in _INERTIA:
+            for name in INERTIA_NAMES:
                 # The names of the diagonal are ixx, iyy and izz.
                 inertia.set(name, moment if name[1] == name[2] else "0")
 
@@ -656,7 +656,7 @@ def _correct_negative(root: etree._Element, urdf: Path) -> None:
 def _add_missing_inertia(root: etree._Element, urdf: Path) -> None:
     for inertial in root.iterfind("link/inertial"):
         if inertial.find("inertia") is None:
-            etree.SubElement(inertial, "inertia", dict(zip(_INERTIA, "100101", strict=True)))
+            etree.SubElement(inertial, "inertia", dict(zip(INERTIA_NAMES, "100101", strict=True)))
 
 
 @_quirk("refuses a repeated element", refusal="repeated element")

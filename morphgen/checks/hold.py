@@ -25,7 +25,7 @@ from morphgen.checks.readers import NO_LIMITS, bullet_client, load_model
 from morphgen.checks.rules import home_penetrations
 from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.bundle import MJCF, URDF, bundle_folder, write_bundle
-from morphgen.formats.quiet import quiet
+from morphgen.formats.quiet import MujocoWarnings, quiet
 from morphgen.model.dynamics import GRAVITY, gravity_load
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import DEFAULT_EFFORT, Joint, Robot
@@ -325,8 +325,6 @@ def overloads(robot: Robot, q: ArrayLike) -> tuple[str, ...]:
 @contextmanager
 def _mjcf(robot: Robot, folder: Path) -> Iterator[SimulatedRobot]:
     import mujoco
-
-    from morphgen.formats.quiet import MujocoWarnings
 
     model = load_model(folder / MJCF)
     if "home" not in (model.key(i).name for i in range(model.nkey)):

@@ -206,13 +206,8 @@ def _no_dynamics(names: Sequence[str], n: int) -> tuple[Array, Array]:
 def _pybullet_joint(info: Sequence[float]) -> JointReading:
     """Return a joint from PyBullet's joint info, whose numbers are items 6 to 11."""
     damping, friction, lower, upper, effort, velocity = info[6:12]
-    return JointReading(
-        limits=(lower, upper) if lower <= upper else NO_LIMITS,
-        effort=effort,
-        velocity=velocity,
-        damping=damping,
-        friction=friction,
-    )
+    limits = (lower, upper) if lower <= upper else NO_LIMITS
+    return JointReading(limits, effort, velocity, damping, friction)
 
 
 def _pinocchio_model(urdf: Path, **options: bool) -> pinocchio.Model:

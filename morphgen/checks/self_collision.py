@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from morphgen.errors import RobotError
+from morphgen.formats.quiet import MujocoWarnings
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import movable_positions, random_configurations
 from morphgen.model.robot import Pair, Robot, sorted_pair
@@ -81,8 +82,6 @@ class SelfCollisionChecker:
         """
         import mujoco
 
-        from morphgen.formats.quiet import MujocoWarnings
-
         model, data, qpos = self._model, self._data, self._data.qpos
         full = data.warning[mujoco.mjtWarning.mjWARN_CONTACTFULL]
         positions = movable_positions(self._robot, self._require_rows(q))
@@ -130,8 +129,6 @@ class SelfCollisionChecker:
     def _collide(self, positions: Array) -> None:
         """Find the contacts at movable joint positions, perturbed slightly where EPA fails."""
         import mujoco
-
-        from morphgen.formats.quiet import MujocoWarnings
 
         for offset in _PERTURBATIONS:
             self._data.qpos[self._qpos] = positions + offset * self._perturbation

@@ -30,6 +30,7 @@ from morphgen.formats.files import replacing_folder
 from morphgen.formats.fits import (
     FITTER_VERSION,
     find_fit,
+    fits_of_copies,
     fits_text,
     has_meshes,
     read_fits,
@@ -318,7 +319,7 @@ def as_convex(robot: Robot, folders: Sequence[Path] = ()) -> Robot:
     )
     return replace(
         convex,
-        fits=_fits_of_pieces(robot, convex, folders),
+        fits=fits_of_copies(robot, convex, read_stored_fits(folders)),  # so tokens stay the same
         provenance={**convex.provenance, "convex": {"coacd": version("coacd"), **SETTINGS}},
     )
 
@@ -405,14 +406,3 @@ def _pieces_of(shape: Shape, pieces: dict[Mesh, list[Path]]) -> list[Shape]:
     if files is None:
         return [shape]
     return [replace(shape, geometry=Mesh(file, mesh.scale)) for file in files]
-
-
-def _fits_of_pieces(robot: Robot, convex: Robot, folders: Sequence[Path]) -> dict[str, StoredFit]:
-    """Return the fits of primitives under the keys of the pieces, so that tokens stay the same."""
-    stored = read_stored_fits(folders)
-    fits = {}
-    for link in robot.links:
-        if fit := find_fit(link.collisions, robot, stored):
-            shapes = convex.link(link.name).collisions
-            fits[shapes_key(shapes)] = fit.scaled(1 / shapes_scale(shapes))
-    return fits

@@ -23,7 +23,7 @@ from morphgen.formats.files import (
     require_unedited,
     require_writable_folder,
 )
-from morphgen.formats.fits import FITS, find_fit, fits_text, read_fits, shapes_key
+from morphgen.formats.fits import FITS, fits_of_copies, fits_text, read_fits
 from morphgen.formats.mjcf.write import mjcf_text
 from morphgen.formats.records import FiniteNumber, Record, read_record
 from morphgen.formats.resolve import default_finder
@@ -251,12 +251,7 @@ def write_fits(robot: Robot, folder: Path) -> None:
     """
     if not robot.fits:
         return
-    written = read_urdf(folder / URDF, keep_order=True)
-    fits = {}
-    for link in robot.links:
-        if fit := find_fit(link.collisions, robot, {}):
-            shapes = written.link(link.name).collisions
-            fits[shapes_key(shapes)] = replace(fit, link=link.name)
+    fits = fits_of_copies(robot, read_urdf(folder / URDF, keep_order=True), {})
     if fits:
         (folder / FITS).write_text(fits_text(fits), encoding="utf-8")
 

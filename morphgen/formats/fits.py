@@ -114,6 +114,16 @@ def find_fit(shapes: Sequence[Shape], robot: Robot, stored: StoredFits) -> Store
     return stored_fit(shapes, stored) if fit is None and has_meshes(shapes) else fit
 
 
+def fits_of_copies(robot: Robot, copy: Robot, stored: StoredFits) -> dict[str, StoredFit]:
+    """Return the known fits of a robot's links under the keys of other meshes of the same links."""
+    fits = {}
+    for link in robot.links:
+        if fit := find_fit(link.collisions, robot, stored):
+            shapes = copy.link(link.name).collisions
+            fits[shapes_key(shapes)] = replace(fit, link=link.name).scaled(1 / shapes_scale(shapes))
+    return fits
+
+
 def shapes_scale(shapes: Sequence[Shape]) -> float:
     """Return the scale of the first mesh; 1 if it is not uniform or there is no mesh."""
     for shape in shapes:

@@ -80,7 +80,7 @@ def _copy_urdf(path: Path, folder: Path, finder: PackageFinder) -> None:
     data = urdf_bytes(path, {}, finder)
     require_bounded_meshes(robot_from_xml(data, path, finder))
     root, _ = parse_description(data, str(path))
-    meshes = resolved_meshes(root, path, finder).files
+    meshes, _, _ = resolved_meshes(root, path, finder)
     _keep_known(root)
     copied = _mesh_copies(folder)
     for shape in root.iterfind("link/*"):

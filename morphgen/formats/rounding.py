@@ -8,6 +8,7 @@ error of these digits, so that the rotation read back rounds to the same point o
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 
 from morphgen.model.geometry import Geometry, Mesh, Pose, Shape, map_dimensions
@@ -21,9 +22,18 @@ _TIE_TOLERANCE = 1e-6
 _UNIT_TOLERANCE = 1e-9  # largest difference of a rounded unit axis's length from 1
 
 
+INERTIA_NAMES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+"""Names of the entries of ``Inertial.inertia`` in URDF and SDFormat, in their order."""
+
+
 def format_number(value: float) -> str:
     """Return a number with 12 significant digits; magnitudes below 1e-12 are zero."""
     return "0" if abs(value) < 1e-12 else f"{value:.12g}"
+
+
+def format_numbers(values: Iterable[float]) -> str:
+    """Return numbers as ``format_number`` does, separated by spaces."""
+    return " ".join(map(format_number, values))
 
 
 def format_inertia(value: float) -> str:

@@ -7,7 +7,14 @@ from collections.abc import Collection, Iterable
 from lxml import etree
 
 from morphgen.errors import FormatError
-from morphgen.formats.rounding import format_inertia, format_number, rounded_axis, rounded_pose
+from morphgen.formats.rounding import (
+    INERTIA_NAMES,
+    format_inertia,
+    format_number,
+    format_numbers,
+    rounded_axis,
+    rounded_pose,
+)
 from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS, MeshUri
 from morphgen.model.geometry import Box, Geometry, Mesh, Pose, dimensions
 from morphgen.model.robot import Inertial, Joint, Link, Robot
@@ -113,8 +120,7 @@ def _write_link(model: etree._Element, link: Link, T_model_link: Pose, mesh_uri:
     etree.SubElement(inertial_element, "mass").text = f"{inertial.mass:.12g}"
     inertia_element = etree.SubElement(inertial_element, "inertia")
     inertia = inertial.inertia if any(inertial.inertia) else _MASSLESS.inertia
-    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    for name, value in zip(names, inertia, strict=True):
+    for name, value in zip(INERTIA_NAMES, inertia, strict=True):
         etree.SubElement(inertia_element, name).text = format_inertia(value)
     for kind, shapes in (("visual", link.visuals), ("collision", link.collisions)):
         for i, shape in enumerate(shapes):
@@ -124,13 +130,13 @@ def _write_link(model: etree._Element, link: Link, T_model_link: Pose, mesh_uri:
             if shape.rgba is not None and kind == "visual":
                 material = etree.SubElement(holder, "material")
                 for tag in ("ambient", "diffuse"):
-                    etree.SubElement(material, tag).text = _join(shape.rgba)
+                    etree.SubElement(material, tag).text = format_numbers(shape.rgba)
 
 
 def _write_geometry(element: etree._Element, geometry: Geometry, mesh_uri: MeshUri) -> None:
     match geometry:
         case Box(size):
-            _write_values(element, "box", size=_join(size))
+            _write_values(element, "box", size=format_numbers(size))
         case Mesh():
             _write_values(element, "mesh", uri=mesh_uri(geometry))
         case _:
@@ -146,7 +152,7 @@ def _write_joint(model: etree._Element, joint: Joint, names: dict[str, str]) -> 
     if not joint.is_movable:
         return
     axis = etree.SubElement(element, "axis")
-    etree.SubElement(axis, "xyz").text = _join(rounded_axis(joint))
+    etree.SubElement(axis, "xyz").text = format_numbers(rounded_axis(joint))
     if joint.mimic is not None:
         mimic = etree.SubElement(axis, "mimic", joint=names[joint.mimic.joint], axis="axis")
         etree.SubElement(mimic, "multiplier").text = format_number(joint.mimic.multiplier)
@@ -175,10 +181,6 @@ def _write_values(parent: etree._Element, tag: str, **values: str) -> None:
 
 
 def _write_pose(element: etree._Element, pose: Pose) -> None:
-    text = f"{_join(pose.position)} {_join(rounded_pose(pose).rpy)}"
+    text = f"{format_numbers(pose.position)} {format_numbers(rounded_pose(pose).rpy)}"
     if text != "0 0 0 0 0 0":
         etree.SubElement(element, "pose").text = text
-
-
-def _join(values: Iterable[float]) -> str:
-    return " ".join(map(format_number, values))

@@ -185,13 +185,6 @@ MAX_BYTES = 2**30  # largest total size of the arrays of an archive [bytes]
 
 
 def read_npz(
-    source: Path | IO[bytes], names: Sequence[str], max_bytes: int | None = None
-) -> list[NDArray[Any]]:
-    """Return arrays of an archive by their names."""
-    return [*read_all(source, names, max_bytes).values()]
-
-
-def read_all(
     source: Path | IO[bytes], names: Sequence[str] | None = None, max_bytes: int | None = None
 ) -> dict[str, NDArray[Any]]:
     """Return arrays of an archive by their names, all of them by default."""

@@ -12,8 +12,8 @@ from morphgen.errors import CompositionError, GrammarError
 from morphgen.grammar.compose import part_values, require_root
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import (
+    Chooser,
     DeriveCache,
-    FirstChooser,
     TooManyPartsError,
     argument,
     count_fewest_parts,
@@ -94,7 +94,7 @@ def _let_values(grammar: Grammar, draw: Draw) -> dict[str, tuple[float, str]]:
 
 
 @dataclass
-class _ScriptedChooser(FirstChooser):
+class _ScriptedChooser(Chooser):
     """Follows a list of decisions, then chooses the first option; records the option counts."""
 
     decisions: list[int]

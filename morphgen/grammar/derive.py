@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 
@@ -23,36 +22,23 @@ Choices = Mapping[str, float]
 """Choices of a derivation by their keys: an alternative's index, a count or a value in SI units."""
 
 
-class Chooser(Protocol):
-    """Makes the choices that a grammar leaves open; the key names the choice."""
+class Chooser:
+    """Makes the choices that a grammar leaves open, without chance; the key names the choice."""
 
     def alternative(self, key: str, weights: list[float]) -> int:
-        """Return the index of an alternative."""
-
-    def count(self, key: str, low: int, high: int) -> int:
-        """Return a number of repetitions from ``low`` to ``high``."""
-
-    def value(self, key: str, distribution: Distribution) -> float:
-        """Return a value of a distribution."""
-
-
-class FirstChooser:
-    """Chooses the first alternative, the smallest count and the typical value."""
-
-    def alternative(self, key: str, weights: list[float]) -> int:
-        """Return the first index with a positive weight."""
+        """Return the index of an alternative: the first one with a positive weight."""
         return next(i for i, weight in enumerate(weights) if weight > 0)
 
     def count(self, key: str, low: int, high: int) -> int:
-        """Return the smallest count."""
+        """Return a number of repetitions: the smallest."""
         return low
 
     def value(self, key: str, distribution: Distribution) -> float:
-        """Return the typical value."""
-        return typical_value(key, distribution)
+        """Return a value of a distribution: the typical one."""
+        return distribution.typical
 
 
-class RandomChooser:
+class RandomChooser(Chooser):
     """Draws every choice from a random generator."""
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -75,7 +61,7 @@ class RandomChooser:
 
 
 @dataclass
-class RecordedChooser:
+class RecordedChooser(Chooser):
     """Repeats recorded choices where they are valid, and records all choices made."""
 
     fallback: Chooser  # makes the choices that are not recorded or not valid
@@ -156,6 +142,7 @@ def derive(
     return run.root().derivation()
 
 
+@dataclass
 class _Run:
     """One derivation.
 
@@ -163,23 +150,19 @@ class _Run:
     ``robot/1.arm/panda.size``, so that it can be recorded and repeated.
     """
 
-    def __init__(
-        self,
-        grammar: Grammar,
-        library: Library,
-        chooser: Chooser,
-        max_parts: int,
-        cache: DeriveCache,
-    ) -> None:
-        self._grammar, self._library, self._chooser = grammar, library, chooser
-        self._max_parts = max_parts
-        self._cache = cache
-        self._pending = cache.fewest_parts.get(grammar.start, 0)
+    _grammar: Grammar
+    _library: Library
+    _chooser: Chooser
+    _max_parts: int
+    _cache: DeriveCache
+    _labels: set[str] = field(default_factory=set)
+    _names: dict[str, tuple[float, str]] = field(default_factory=dict)  # values of ``let``
+
+    def __post_init__(self) -> None:
+        self._pending = self._cache.fewest_parts.get(self._grammar.start, 0)
         """Smallest number of parts that are still to be added."""
-        self._labels: set[str] = set()
-        self._names: dict[str, tuple[float, str]] = {}
-        for let in grammar.lets:
-            scope = Scope(self._names, chooser.value, f"let {let.name}")
+        for let in self._grammar.lets:
+            scope = Scope(self._names, self._chooser.value, f"let {let.name}")
             self._names[let.name] = evaluate(let.expression, _with_unique_keys(scope))
 
     def root(self) -> _Node:

@@ -70,29 +70,16 @@ def load_part(manifest: Manifest, values: Mapping[str, float] | None = None) -> 
     complete = resolve_values(values or {}, manifest.parameters, manifest.name)
     source = manifest.path if isinstance(manifest.source, PackageSource) else manifest.source
     stamps = (file_stamp(manifest.path), file_stamp(source))
-    return _load(_Request(manifest.path, stamps, tuple(complete.items()), manifest))
+    return _load(_Loader((manifest.path, stamps, tuple(complete.items())), manifest, complete))
 
 
 @dataclass(frozen=True)
-class _Request:
-    """A part with the values of its parameters."""
-
-    path: Path
-    stamps: tuple[tuple[int, int], ...]  # states of the manifest's file and of the source's
-    values: tuple[tuple[str, float], ...]
-    manifest: Manifest = field(compare=False)
-
-
-@lru_cache(maxsize=256)
-def _load(request: _Request) -> Part:
-    return _Loader(request.manifest, dict(request.values)).load()
-
-
 class _Loader:
     """Reads a part's source and applies the manifest's corrections, frames and scaling."""
 
-    def __init__(self, manifest: Manifest, values: Mapping[str, float]) -> None:
-        self._manifest, self._values = manifest, values
+    key: tuple[object, ...]  # path, states of the manifest and the source, values of parameters
+    _manifest: Manifest = field(compare=False)
+    _values: Mapping[str, float] = field(compare=False)
 
     def load(self) -> Part:
         manifest = self._manifest
@@ -250,6 +237,11 @@ class _Loader:
 
     def _error(self, text: str) -> PartError:
         return PartError(f"{self._manifest.path}: {text}")
+
+
+@lru_cache(maxsize=256)
+def _load(loader: _Loader) -> Part:
+    return loader.load()
 
 
 def _without_meshes(shapes: tuple[Shape, ...], names: Collection[str]) -> tuple[Shape, ...]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from morphgen.errors import CompositionError, GrammarError, nearest
 from morphgen.grammar.analysis import load_sound_grammar
 from morphgen.grammar.derivation import Derivation
-from morphgen.grammar.derive import FirstChooser, derive
+from morphgen.grammar.derive import Chooser, derive
 from morphgen.grammar.grammar_file import SUFFIX, Grammar, grammar_names
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import MOUNT_YAW, Manifest, PartKind, parse_value, resolve_values
@@ -169,7 +169,7 @@ def parse_words(words: Sequence[str], library: Library) -> tuple[Derivation, str
     grammars = known_grammars(library)
     if first in grammars or first.endswith(SUFFIX):
         grammar = load_sound_grammar(first, library)
-        derivation = derive(pin(grammar, words[1:], library), library, FirstChooser())
+        derivation = derive(pin(grammar, words[1:], library), library, Chooser())
         return derivation, "-".join([grammar.name, *([derivation.digest[:8]] if words[1:] else [])])
     if "=" not in first and len(words) > 1 and first not in library.paths:
         raise CompositionError(

@@ -15,7 +15,7 @@ import json
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import zip_longest
@@ -109,32 +109,26 @@ def make_set(config: SetConfig, n: int, work: SetWorker) -> SetReport:
 
 
 def _make_robots(config: SetConfig, n: int, work: SetWorker) -> SetReport:
-    with locked_folder(config.folder), own_progress() as show, _deleting_if_without_robots(config):
+    with locked_folder(config.folder), own_progress() as show:
         finished = _finished(config)
         missing = [i for i in range(n) if i not in finished]
         show(n - len(missing), n)
         path = config.folder / JOURNAL
-        with naming(path), path.open("a", encoding="utf-8") as journal:
-            journal.write("\n")  # ends a line that an interruption cut short
-            for made, record in enumerate(work(config, missing), 1):
-                journal.write(json.dumps(record) + "\n")
-                journal.flush()  # a killed run keeps what it has made
-                show(n - len(missing) + made, n)
+        try:
+            with naming(path), path.open("a", encoding="utf-8") as journal:
+                journal.write("\n")  # ends a line that an interruption cut short
+                for made, record in enumerate(work(config, missing), 1):
+                    journal.write(json.dumps(record) + "\n")
+                    journal.flush()  # a killed run keeps what it has made
+                    show(n - len(missing) + made, n)
+        except MorphgenError:
+            if not _finished(config):
+                for name in (JOURNAL, INDEX, SETTINGS, GRAMMAR):
+                    (config.folder / name).unlink(missing_ok=True)
+            raise
         report = _write_index(config, len(missing), len(finished))
         path.unlink()
     return report
-
-
-@contextmanager
-def _deleting_if_without_robots(config: SetConfig) -> Iterator[None]:
-    """Delete the files of a set that has no robot when an error ends the block."""
-    try:
-        yield
-    except MorphgenError:
-        if not _finished(config):
-            for name in (JOURNAL, INDEX, SETTINGS, GRAMMAR):
-                (config.folder / name).unlink(missing_ok=True)
-        raise
 
 
 class RobotMaker:

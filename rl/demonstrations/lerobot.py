@@ -21,7 +21,7 @@ from morphgen.errors import TaskError
 from morphgen.extras import explain_missing_extras
 from morphgen.files import replacing_file, write_cache_file
 from morphgen.formats.data_files import parse_json, read_json, read_text
-from morphgen.formats.zip_files import read_all
+from morphgen.formats.zip_files import read_npz
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import CONTROL_PERIOD
 
@@ -69,7 +69,7 @@ def is_data_set(folder: Path) -> bool:
 
 def read_shard(path: Path) -> tuple[list[dict[str, Any]], Arrays]:
     """Return the episodes of a shard, and the arrays of their steps, one after another."""
-    arrays = read_all(path)
+    arrays = read_npz(path)
     return json.loads(str(arrays.pop("episodes"))), arrays
 
 

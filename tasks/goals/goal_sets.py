@@ -160,7 +160,7 @@ def set_from_npz(content: bytes, kind: type[G]) -> G:
     names = [field.name for field in fields(kind)]
     # Sets are stored without compression; thousands of them may be read from a stranger's folder.
     arrays = read_npz(io.BytesIO(content), names, max_bytes=2**22 + 16 * len(content))
-    return kind(**{name: _value(name, array) for name, array in zip(names, arrays, strict=True)})
+    return kind(**{name: _value(name, array) for name, array in arrays.items()})
 
 
 def arrays_of(goals: GoalSet) -> dict[str, NDArray[Any]]:

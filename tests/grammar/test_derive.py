@@ -9,7 +9,7 @@ from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError, MorphgenError
 from morphgen.grammar.derivation import Derivation, difference, outline, parse_derivation
 from morphgen.grammar.derive import (
-    FirstChooser,
+    Chooser,
     RandomChooser,
     RecordedChooser,
     TooManyPartsError,
@@ -21,7 +21,7 @@ from morphgen.grammar.syntax import MAX_PARTS
 
 
 def first(*lines):
-    return derive(grammar(*lines), LIBRARY, FirstChooser())
+    return derive(grammar(*lines), LIBRARY, Chooser())
 
 
 def draw(robot_grammar, seed=0):
@@ -153,7 +153,7 @@ def test_recorded_choices_reproduce_the_derivation(name):
         recorded = RecordedChooser(RandomChooser(np.random.default_rng(seed)))
         tree = derive(grammar, LIBRARY, recorded)
         written = {key: float(f"{value:.12g}") for key, value in recorded.choices.items()}
-        again = RecordedChooser(FirstChooser(), written)
+        again = RecordedChooser(Chooser(), written)
         assert derive(grammar, LIBRARY, again) == tree
         assert again.choices == recorded.choices
 
@@ -162,8 +162,8 @@ def test_invalid_recorded_choices_fall_back_to_the_other_chooser():
     links = "links -> beam(length=uniform(0.1, 0.5)){2,4} | jaw"
     robot_grammar = grammar("robot -> post links", links)
     given = {"robot/1.links": 7.0, "robot/1.links/0.beam#": 9.0, "nowhere": 1.0}
-    repeated = derive(robot_grammar, LIBRARY, RecordedChooser(FirstChooser(), given))
-    assert repeated == derive(robot_grammar, LIBRARY, FirstChooser())
+    repeated = derive(robot_grammar, LIBRARY, RecordedChooser(Chooser(), given))
+    assert repeated == derive(robot_grammar, LIBRARY, Chooser())
 
 
 def test_a_recursion_may_terminate():
@@ -186,11 +186,11 @@ def test_an_endless_recursion_is_an_error(lines):
 
 def test_no_robot_has_more_parts_than_allowed():
     robot_grammar = grammar("robot -> slides bead{99}")
-    assert sum(1 for _ in derive(robot_grammar, LIBRARY, FirstChooser()).walk()) == MAX_PARTS == 100
+    assert sum(1 for _ in derive(robot_grammar, LIBRARY, Chooser()).walk()) == MAX_PARTS == 100
     with pytest.raises(TooManyPartsError, match="more than 100 parts: does it end"):
         first("robot -> slides bead{100}")
     with pytest.raises(TooManyPartsError, match="more than 3 parts"):
-        derive(robot_grammar, LIBRARY, FirstChooser(), max_parts=3)
+        derive(robot_grammar, LIBRARY, Chooser(), max_parts=3)
 
 
 @pytest.mark.parametrize(
@@ -336,7 +336,7 @@ def test_a_grammar_names_the_parameter_that_was_meant():
 
 
 def pinned_nodes(links_grammar, *words):
-    return derive(pin(links_grammar, words, LIBRARY), LIBRARY, FirstChooser()).walk()
+    return derive(pin(links_grammar, words, LIBRARY), LIBRARY, Chooser()).walk()
 
 
 def parts(*grammar_and_words):

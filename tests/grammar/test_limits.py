@@ -15,7 +15,7 @@ from morphgen.grammar.analysis import (
     enumerate_structures,
 )
 from morphgen.grammar.derivation import parse_derivation
-from morphgen.grammar.derive import FirstChooser, RandomChooser, derive
+from morphgen.grammar.derive import Chooser, RandomChooser, derive
 from morphgen.grammar.grammar_file import grammar_text, load_grammar
 from morphgen.grammar.syntax import MAX_COUNT, MAX_NESTING, MAX_PARTS, parse_condition
 
@@ -141,7 +141,7 @@ def test_numbers_that_are_not_finite_are_faults(line, message):
 def test_weights_with_an_infinite_sum_are_errors():
     robot_grammar = grammar("robot -> @weight(1e308) cubes | @weight(1e308) cartpole")
     with pytest.raises(GrammarError, match="g:1:1: the sum of weights of 'robot' is infinite"):
-        derive(robot_grammar, LIBRARY, FirstChooser())
+        derive(robot_grammar, LIBRARY, Chooser())
 
 
 def test_the_smallest_positive_weight_is_respected():

@@ -23,7 +23,7 @@ from morphgen.grammar.analysis import (
     variables,
 )
 from morphgen.grammar.compose import join
-from morphgen.grammar.derive import FirstChooser, RandomChooser, derive
+from morphgen.grammar.derive import Chooser, RandomChooser, derive
 from morphgen.grammar.grammar_file import (
     find_grammar,
     grammar_from_text,
@@ -406,7 +406,7 @@ def write(tmp_path):
 
 
 def first(grammar):
-    return str(derive(grammar, LIBRARY, FirstChooser()))
+    return str(derive(grammar, LIBRARY, Chooser()))
 
 
 def test_there_is_a_grammar_for_each_category_and_one_for_serial_arms():

@@ -21,7 +21,7 @@ from morphgen.formats.bundle import bundle_folder, split_colours, write_bundle
 from morphgen.formats.rounding import format_number
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation, outline, parse_derivation
-from morphgen.grammar.derive import FirstChooser, derive
+from morphgen.grammar.derive import Chooser, derive
 from morphgen.grammar.grammar_file import SUFFIX, grammar_from_text, grammar_names, grammar_text
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Parameter, PartKind, parse_value
@@ -401,7 +401,7 @@ class GrammarTab(ComposingTab):
     def _compose(self) -> Shown:
         session, library = self._session, self._library
         grammar = grammar_from_text(self._text.value, self._name)
-        derivation = derive(grammar, library, FirstChooser())
+        derivation = derive(grammar, library, Chooser())
         robot = compose(derivation, library, self._name)  # also checks the grammar
         is_edited = self._text.value != self._original
         name = shlex.quote(f"{self._name}{SUFFIX}" if is_edited else self._source)

@@ -168,9 +168,14 @@ def _keep_known(root: etree._Element, path: Path) -> None:
     """Remove what a robot does not need from a file, and refuse what MuJoCo must not get."""
     if root.tag not in ("mujoco", "mujocoinclude"):
         raise FormatError(f"{path}: the root element is <{root.tag}>, not <mujoco>")
-    _require_plain(root, path)
     for element in [*root.iter()]:
         tag = str(element.tag)
+        for attribute in map(etree.QName, (tag, *map(str, element.attrib))):
+            if attribute.namespace is not None:
+                raise FormatError(
+                    f"{path}:{element.sourceline}: {attribute.localname!r} has the namespace "
+                    f"{attribute.namespace!r}; names in an MJCF have none, remove it"
+                )
         if tag in _SCHEMA.refused:
             name = element.get("name") or element.get("plugin") or element.get("model")
             label = f"<{tag}>" if name is None else f"<{tag}> {name!r}"
@@ -213,16 +218,6 @@ def _left_out_findings(root: etree._Element, path: Path) -> Iterator[Finding]:
         what = ", ".join(f"{n} {name}=..." for name, n in sorted(counts.items()))
         where = f"{path}:{places[0][0].sourceline}"
         yield found("attribute-unread/known", where, what=f"{what} of <{tag}>")
-
-
-def _require_plain(root: etree._Element, path: Path) -> None:
-    for element in root.iter():
-        for name in map(etree.QName, (str(element.tag), *map(str, element.attrib))):
-            if name.namespace is not None:
-                raise FormatError(
-                    f"{path}:{element.sourceline}: {name.localname!r} has the namespace "
-                    f"{name.namespace!r}; names in an MJCF have none, remove it"
-                )
 
 
 def _require_few_elements(root: etree._Element, path: Path) -> None:

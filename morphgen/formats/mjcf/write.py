@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import PurePosixPath
 
@@ -12,6 +12,7 @@ from lxml import etree
 
 from morphgen.errors import FormatError
 from morphgen.formats.quiet import log_mujoco_warnings
+from morphgen.formats.rounding import format_inertia, format_number, format_numbers
 from morphgen.formats.urdf.write import MUJOCO_BOUNDS
 from morphgen.model.dynamics import Actuation, actuation, armature
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
@@ -53,7 +54,7 @@ class Meshes:
         for file, name in self._files.items():
             etree.SubElement(asset, "mesh", name=name, file=file, inertia="shell")
         for name, vertices in self._vertices.items():
-            vertex = join(vertices.ravel().tolist())
+            vertex = format_numbers(vertices.ravel().tolist())
             etree.SubElement(asset, "mesh", name=name, vertex=vertex)
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
@@ -90,13 +91,13 @@ def geom_attributes(shape: Shape, meshes: Meshes, *, collision: bool) -> dict[st
     """Return the type, size or mesh, and pose attributes of a shape's ``<geom>``."""
     match shape.geometry:
         case Box(size):
-            form = {"type": "box", "size": join(edge / 2 for edge in size)}
+            form = {"type": "box", "size": format_numbers(edge / 2 for edge in size)}
         case Sphere(radius):
-            form = {"type": "sphere", "size": join([radius])}
+            form = {"type": "sphere", "size": format_number(radius)}
         case Cylinder(radius, length):
-            form = {"type": "cylinder", "size": join([radius, length / 2])}
+            form = {"type": "cylinder", "size": format_numbers([radius, length / 2])}
         case Capsule(radius, length):
-            form = {"type": "capsule", "size": join([radius, length / 2])}
+            form = {"type": "capsule", "size": format_numbers([radius, length / 2])}
         case Mesh():
             form = {"type": "mesh", "mesh": meshes.name(shape.geometry, collision=collision)}
     return form | pose_attributes(shape.T_link_shape)
@@ -105,23 +106,18 @@ def geom_attributes(shape: Shape, meshes: Meshes, *, collision: bool) -> dict[st
 def joint_attributes(joint: Joint) -> dict[str, str]:
     """Return the name, type and axis attributes of a movable joint."""
     kind = "slide" if joint.kind == "prismatic" else "hinge"
-    return {"name": joint.name, "type": kind, "axis": join(joint.unit_axis)}
+    return {"name": joint.name, "type": kind, "axis": format_numbers(joint.unit_axis)}
 
 
 def pose_attributes(pose: Pose) -> dict[str, str]:
     """Return the pose attributes of an element; none for the identity."""
     attributes = {}
-    position, quaternion = join(pose.position), join(pose.quaternion)
+    position, quaternion = format_numbers(pose.position), format_numbers(pose.quaternion)
     if position != "0 0 0":
         attributes["pos"] = position
     if quaternion != "1 0 0 0":
         attributes["quat"] = quaternion
     return attributes
-
-
-def join(values: Iterable[float], zero: float = 1e-12) -> str:
-    """Return numbers with 12 significant digits; magnitudes below ``zero`` are zero."""
-    return " ".join("0" if abs(value) < zero else f"{value:.12g}" for value in values)
 
 
 def _thickened(vertices: Array) -> Array | None:
@@ -233,7 +229,7 @@ def _write_bodies(
             for shape in shapes:
                 attributes = geom_attributes(shape, meshes, collision=kind == "collision")
                 if shape.rgba is not None:
-                    attributes["rgba"] = join(shape.rgba)
+                    attributes["rgba"] = format_numbers(shape.rgba)
                 etree.SubElement(body, "geom", {"class": kind} | attributes)
         for site in sites.get(link.name, ()):
             etree.SubElement(body, "site", site)
@@ -244,11 +240,10 @@ def _write_inertial(body: etree._Element, link: Link) -> None:
     if link.inertial is None or link.inertial.mass == 0:
         return
     xx, xy, xz, yy, yz, zz = link.inertial.inertia
-    mass = join([link.inertial.mass], zero=0)
-    inertial = etree.SubElement(body, "inertial", pos=join(link.inertial.com), mass=mass)
-    # Inertia of fingers is far below the zero of lengths.
-    off_diagonal = join([xy, xz, yz], zero=1e-18)
-    diagonal = join([xx, yy, zz], zero=1e-18)
+    mass = f"{link.inertial.mass:.12g}"
+    inertial = etree.SubElement(body, "inertial", pos=format_numbers(link.inertial.com), mass=mass)
+    off_diagonal = " ".join(map(format_inertia, (xy, xz, yz)))
+    diagonal = " ".join(map(format_inertia, (xx, yy, zz)))
     if off_diagonal == "0 0 0":
         inertial.set("diaginertia", diagonal)
     else:
@@ -261,11 +256,11 @@ def _write_joint(body: etree._Element, joint: Joint, armature: float) -> None:
     if limits is not None:
         element.set("range", limits)
     if armature:
-        element.set("armature", join([armature]))
+        element.set("armature", format_number(armature))
     if joint.damping:
-        element.set("damping", join([joint.damping]))
+        element.set("damping", format_number(joint.damping))
     if joint.friction:
-        element.set("frictionloss", join([joint.friction]))
+        element.set("frictionloss", format_number(joint.friction))
 
 
 def _write_constraints(root: etree._Element, robot: Robot) -> None:
@@ -283,7 +278,7 @@ def _write_constraints(root: etree._Element, robot: Robot) -> None:
         )
         for column in np.flatnonzero(matrix[row]).tolist():
             element.set("joint2", robot.joints[robot.independent_joints[column]].name)
-        element.set("polycoef", join([offset[row], matrix[row].sum(), 0, 0, 0]))
+        element.set("polycoef", format_numbers([offset[row], matrix[row].sum(), 0, 0, 0]))
 
 
 def _write_actuators(root: etree._Element, robot: Robot, gains: tuple[Actuation, ...]) -> None:
@@ -301,7 +296,7 @@ def _write_actuators(root: etree._Element, robot: Robot, gains: tuple[Actuation,
         if limits is not None:
             element.set("ctrlrange", limits)
         if gain.effort:
-            element.set("forcerange", join([-gain.effort, gain.effort]))
+            element.set("forcerange", format_numbers([-gain.effort, gain.effort]))
 
 
 def _write_home(root: etree._Element, robot: Robot, world: etree._Element) -> None:
@@ -310,9 +305,10 @@ def _write_home(root: etree._Element, robot: Robot, world: etree._Element) -> No
     key = etree.SubElement(etree.SubElement(root, "keyframe"), "key", name="home")
     if positions:
         # MuJoCo's qpos is in the order of the document, depth first, and not in the robot's.
-        key.set("qpos", join(positions[joint.get("name", "")] for joint in world.iter("joint")))
+        names = (joint.get("name", "") for joint in world.iter("joint"))
+        key.set("qpos", format_numbers(positions[name] for name in names))
     if robot.home:
-        key.set("ctrl", join(robot.home))
+        key.set("ctrl", format_numbers(robot.home))
 
 
 def _limits(joint: Joint) -> str | None:
@@ -324,7 +320,7 @@ def _limits(joint: Joint) -> str | None:
             f"joint {joint.name!r}: limits ({lower:g}, {upper:g}) leave no range; MJCF "
             "needs lower < upper, or make the joint fixed"
         )
-    return join(joint.limits)
+    return format_numbers(joint.limits)
 
 
 class MujocoKinematics:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import cast
 
@@ -22,6 +22,7 @@ from morphgen.formats.resolve import (
     find_file,
     package_source,
 )
+from morphgen.formats.rounding import INERTIA_NAMES
 from morphgen.formats.urdf.schema import CHILDREN, above_free_base, structure_findings
 from morphgen.formats.urdf.write import MORPHGEN_TAG, joined_capsules
 from morphgen.formats.xml import found, parse_description
@@ -47,7 +48,6 @@ from morphgen.model.rotation import Vec3
 
 MAX_URDF_BYTES = 8 * 2**20  # largest URDF that is read [bytes]
 _MESH = "geometry[1]/mesh"
-_INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 class UnsoundError(FormatError):
@@ -127,9 +127,9 @@ def robot_from_xml(
         raise UnsoundError(str(path), errors)
     for element in () if trusted else above_free_base(root):
         root.remove(element)
-    meshes = resolved_meshes(root, path, finder)
+    meshes, packages, mesh_findings = resolved_meshes(root, path, finder)
     colours, unknown = _named_colours(root, str(path))
-    link_list = [_link(element, meshes.files, colours) for element in root.iterfind("link")]
+    link_list = [_link(element, meshes, colours) for element in root.iterfind("link")]
     links = {link.name: link for link in link_list}
     joints = [_joint(element) for element in root.iterfind("joint")]
     joint_names = {joint.name for joint in joints}
@@ -147,7 +147,7 @@ def robot_from_xml(
     # Locations without the folder make the card the same on every machine.
     source_findings = tuple(
         replace(finding, where=f"{path.name}{finding.where.removeprefix(str(path))}")
-        for finding in (*repairs, *findings, *meshes.findings, *unknown)
+        for finding in (*repairs, *findings, *mesh_findings, *unknown)
     )
     name = root.get("name", "")
     robot = Robot(
@@ -155,7 +155,7 @@ def robot_from_xml(
         tuple(links[link] for link in order),
         tuple(joints),
         home=home,
-        provenance={"packages": meshes.packages} if meshes.packages else {},
+        provenance={"packages": packages} if packages else {},
         source_findings=source_findings,
     )
     frames = [frame.get("name", "") for frame in root.iterfind(f"{MORPHGEN_TAG}/frame")]
@@ -192,17 +192,13 @@ def _written_home(root: etree._Element, origin: str) -> dict[str, float]:
     return home
 
 
-@dataclass(frozen=True)
-class _Meshes:
-    """The meshes of a URDF."""
+def resolved_meshes(
+    root: etree._Element, path: Path, finder: PackageFinder
+) -> tuple[dict[str, Path], list[dict[str, str]], list[Finding]]:
+    """Return the files of all meshes by URI, the installed packages that they are of, and findings.
 
-    files: Mapping[str, Path]  # file of each mesh by its URI
-    packages: list[dict[str, str]]  # installed packages that files come from, for the card
-    findings: list[Finding]
-
-
-def resolved_meshes(root: etree._Element, path: Path, finder: PackageFinder) -> _Meshes:
-    """Find the files of all meshes; remove shapes without one, if the finder skips them."""
+    Shapes without a file are removed, if the finder skips them.
+    """
     known: dict[str, FoundFile] = {}
     missing: dict[str, Finding] = {}
     for element in root.iterfind(f"link/*/{_MESH}"):
@@ -231,7 +227,7 @@ def resolved_meshes(root: etree._Element, path: Path, finder: PackageFinder) -> 
         findings.append(found("mesh-skipped", first.where, error=first.why, **values))
     files = {uri: file.path for uri, file in known.items()}
     require_bounded_files(files.values(), str(path))
-    return _Meshes(files, packages, findings)
+    return files, packages, findings
 
 
 def _find_mesh(uri: str, root: etree._Element, path: Path, finder: PackageFinder) -> FoundFile:
@@ -382,7 +378,7 @@ def _inertial(element: etree._Element | None) -> Inertial | None:
         return None
     T = _origin(element)
     inertia = element.find("inertia")
-    xx, xy, xz, yy, yz, zz = (_number(inertia, name) or 0.0 for name in _INERTIA)
+    xx, xy, xz, yy, yz, zz = (_number(inertia, name) or 0.0 for name in INERTIA_NAMES)
     inertial = Inertial(mass, T.position, (xx, xy, xz, yy, yz, zz))
     if T.quaternion == IDENTITY.quaternion:
         return inertial

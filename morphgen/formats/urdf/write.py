@@ -8,7 +8,14 @@ from math import dist
 from lxml import etree
 
 from morphgen.errors import FormatError
-from morphgen.formats.rounding import format_inertia, format_number, rounded_axis, rounded_pose
+from morphgen.formats.rounding import (
+    INERTIA_NAMES,
+    format_inertia,
+    format_number,
+    format_numbers,
+    rounded_axis,
+    rounded_pose,
+)
 from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Shape, Sphere
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Inertial, Joint, Link, Robot
 
@@ -117,9 +124,8 @@ def _write_link(root: etree._Element, link: Link, mesh_uri: MeshUri) -> None:
     inertial_element = etree.SubElement(element, "inertial")
     _write_origin(inertial_element, Pose(inertial.com))
     etree.SubElement(inertial_element, "mass", value=format_number(inertial.mass))
-    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    values = {name: format_inertia(v) for name, v in zip(names, inertial.inertia, strict=True)}
-    etree.SubElement(inertial_element, "inertia", values)
+    values = zip(INERTIA_NAMES, map(format_inertia, inertial.inertia), strict=True)
+    etree.SubElement(inertial_element, "inertia", dict(values))
     for kind, shapes in (("visual", link.visuals), ("collision", link.collisions)):
         pieces = ((whole, piece) for whole in shapes for piece in urdf_pieces(whole))
         for i, (whole, shape) in enumerate(pieces):
@@ -128,14 +134,14 @@ def _write_link(root: etree._Element, link: Link, mesh_uri: MeshUri) -> None:
             _write_origin(holder, shape.T_link_shape)
             _write_geometry(etree.SubElement(holder, "geometry"), shape.geometry, mesh_uri)
             if shape.rgba is not None and kind == "visual":
-                colour = _join(shape.rgba)
+                colour = format_numbers(shape.rgba)
                 material = etree.SubElement(holder, "material", name=f"{link.name}_material_{i}")
                 etree.SubElement(material, "color", rgba=colour)
 
 
 def _write_origin(element: etree._Element, pose: Pose) -> None:
-    xyz = _join(pose.position)
-    rpy = _join(rounded_pose(pose).rpy)
+    xyz = format_numbers(pose.position)
+    rpy = format_numbers(rounded_pose(pose).rpy)
     if (xyz, rpy) != ("0 0 0", "0 0 0"):
         etree.SubElement(element, "origin", xyz=xyz, rpy=rpy)
 
@@ -143,7 +149,7 @@ def _write_origin(element: etree._Element, pose: Pose) -> None:
 def _write_geometry(element: etree._Element, geometry: Geometry, mesh_uri: MeshUri) -> None:
     match geometry:
         case Box(size):
-            etree.SubElement(element, "box", size=_join(size))
+            etree.SubElement(element, "box", size=format_numbers(size))
         case Sphere(radius):
             etree.SubElement(element, "sphere", radius=format_number(radius))
         case Cylinder(radius, length):
@@ -162,7 +168,7 @@ def _write_joint(root: etree._Element, joint: Joint) -> None:
     etree.SubElement(element, "child", link=joint.child)
     if not joint.is_movable:
         return
-    etree.SubElement(element, "axis", xyz=_join(rounded_axis(joint)))
+    etree.SubElement(element, "axis", xyz=format_numbers(rounded_axis(joint)))
     effort = DEFAULT_EFFORT if joint.effort is None else joint.effort
     velocity = DEFAULT_VELOCITY if joint.velocity is None else joint.velocity
     limit = {"effort": effort, "velocity": velocity}
@@ -183,7 +189,3 @@ def _write_joint(root: etree._Element, joint: Joint) -> None:
 
 def _texts(values: Mapping[str, float]) -> dict[str, str]:
     return {name: format_number(value) for name, value in values.items()}
-
-
-def _join(values: Iterable[float]) -> str:
-    return " ".join(map(format_number, values))
