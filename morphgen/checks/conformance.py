@@ -32,14 +32,9 @@ from morphgen.formats.resolve import PackageFinder, default_finder
 from morphgen.formats.rounding import INERTIA_NAMES
 from morphgen.formats.urdf.read import robot_from_xml
 from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS
+from morphgen.model import kinematics
 from morphgen.model.dynamics import actuation, gravity_load, mass_matrix
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import (
-    forward_kinematics,
-    frame_pose,
-    movable_positions,
-    random_configurations,
-)
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Frame, Joint, Mimic, Robot
 from morphgen.typing import Array
 
@@ -188,14 +183,14 @@ def _configurations(robot: Robot, samples: int, seed: int) -> Array:
         for joint in robot.joints
     )
     robot = replace(robot, joints=joints)
-    q = random_configurations(robot, samples, np.random.default_rng(seed))
+    q = kinematics.random_configurations(robot, samples, np.random.default_rng(seed))
     return np.clip(q, -MAX_POSITION, MAX_POSITION)
 
 
 def _positions(robot: Robot, q: Array) -> dict[str, Array]:
     """Return the positions of every movable joint by name, shape (n,)."""
     names = [robot.joints[k].name for k in robot.movable_joints]
-    return dict(zip(names, movable_positions(robot, q).T, strict=True))
+    return dict(zip(names, kinematics.movable_positions(robot, q).T, strict=True))
 
 
 def _row(
@@ -227,7 +222,9 @@ def _read(
 def _compared(
     loader: Loader, robot: Robot, reading: Reading, frame: str, q: Array
 ) -> ConformanceRow:
-    expected = frame_pose(robot, q, frame) if frame else np.tile(np.eye(4), (len(q), 1, 1))
+    expected = (
+        kinematics.frame_pose(robot, q, frame) if frame else np.tile(np.eye(4), (len(q), 1, 1))
+    )
     position_offset = reading.T_root_frame[:, :3, 3] - expected[:, :3, 3]
     position_error = float(np.linalg.norm(position_offset, axis=1).max(initial=0.0))
     # The Frobenius norm of the difference of two rotations is sqrt(8) sin(angle / 2), from which
@@ -404,7 +401,7 @@ def _added_inertia(robot: Robot, q: Array) -> float:
 
     Each may get ``BOUND_MASS`` and ``BOUND_INERTIA``, at most two poses of the tree from an axis.
     """
-    T_root_link = forward_kinematics(robot, q)
+    T_root_link = kinematics.forward_kinematics(robot, q)
     lengths = [np.linalg.norm(frame.T_link_frame.position) for frame in robot.frames]
     size = np.linalg.norm(T_root_link[..., :3, 3], axis=-1).max() + max(lengths, default=0.0)
     gains = np.maximum(np.abs(robot.mimic_map[0]).sum(axis=0), 1.0).max(initial=1.0)

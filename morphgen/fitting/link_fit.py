@@ -22,15 +22,9 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from morphgen.errors import FitError
+from morphgen.fitting import search
 from morphgen.fitting.canonical import KINDS, Kind, least_rotation, rounded
 from morphgen.fitting.quality import Quality, quality, signed_distance
-from morphgen.fitting.search import (
-    SampledSolid,
-    best_several,
-    best_single,
-    best_spheres,
-    sample_solid,
-)
 from morphgen.fitting.solid import Solid, solid_of
 from morphgen.formats.fits import MAX_PRIMITIVES, are_primitives, shape_to_data
 from morphgen.model import rotation
@@ -223,7 +217,7 @@ def _balls_through(pivot: Array, support: Array) -> Iterator[tuple[float, Array,
 
 
 def enclose_solid(
-    target: SampledSolid, max_primitives: int, iou: float, seed: int
+    target: search.SampledSolid, max_primitives: int, iou: float, seed: int
 ) -> tuple[Shape, ...]:
     """Return the fewest primitives that contain a solid with at least ``iou``, or the best.
 
@@ -243,7 +237,7 @@ def enclose_solid(
     return best
 
 
-def _enclose_clusters(target: SampledSolid, k: int, seed: int) -> tuple[Shape, ...]:
+def _enclose_clusters(target: search.SampledSolid, k: int, seed: int) -> tuple[Shape, ...]:
     """Return a primitive around each of ``k`` pieces; empty if a piece is flat or empty."""
     inside = target.link_points[target.inside]
     centres, _ = kmeans2(inside, k, minit="++", seed=seed, iter=10)
@@ -279,7 +273,7 @@ def _cut(mesh: trimesh.Trimesh, centres: Array, i: int) -> Array:
     return np.asarray(vertices[np.unique(faces)]) if len(faces) else np.zeros((0, 3))
 
 
-def _iou(shapes: tuple[Shape, ...], target: SampledSolid) -> float:
+def _iou(shapes: tuple[Shape, ...], target: search.SampledSolid) -> float:
     held, inside = signed_distance(shapes, target.link_points) <= 0, target.inside
     return float(target.weights[held & inside].sum() / target.weights[held | inside].sum())
 
@@ -364,19 +358,19 @@ def fit_shapes(
 def fit_solid(solid: Solid, options: FitOptions) -> LinkFit:
     """Fit a solid; see ``fit_shapes``."""
     start = time.perf_counter()
-    target = sample_solid(solid, options.seed)
+    target = search.sample_solid(solid, options.seed)
     if options.spheres is not None:
-        found = best_spheres(target, options.spheres, options.cover, options.seed)
+        found = search.best_spheres(target, options.spheres, options.cover, options.seed)
         return _measure(found.shapes, None, solid, start)
     if options.enclose:
         shapes = enclose_solid(target, options.max_primitives, options.iou, options.seed)
         return _measure(shapes, None, solid, start)
-    best = latest = best_single(target)
+    best = latest = search.best_single(target)
     (single,) = best.shapes
     for _ in range(1, options.max_primitives):
         if best.iou >= options.iou:
             break
-        more = best_several(target, latest, options.seed)
+        more = search.best_several(target, latest, options.seed)
         if more is None:
             break
         latest = more

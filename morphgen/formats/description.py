@@ -10,14 +10,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from morphgen.errors import FormatError, nearest
+from morphgen.formats import resolve
 from morphgen.formats.data_files import kept_reading
-from morphgen.formats.resolve import (
-    PackageFinder,
-    default_finder,
-    distribution_file,
-    finds_installed_only,
-    is_installed,
-)
 from morphgen.formats.urdf.read import read_urdf, require_description_file, require_no_arguments
 from morphgen.formats.xml import root_tag
 from morphgen.model.findings import Finding
@@ -33,7 +27,7 @@ _MAX_HEAD = 2**20  # number of bytes within which the root element of an MJCF be
 def read_description(
     path: Path,
     args: Mapping[str, str] | None = None,
-    finder: PackageFinder | None = None,
+    finder: resolve.PackageFinder | None = None,
     *,
     root_link: str | None = None,
     written_frames: bool = False,
@@ -50,12 +44,12 @@ def read_description(
 
 def read_installed(package: str, file: str, args: Mapping[str, str]) -> Robot:
     """Read a description of an installed data package, kept in the user's cache."""
-    path, finder = distribution_file(package, file), default_finder()
+    path, finder = resolve.distribution_file(package, file), resolve.default_finder()
 
     def read() -> Robot:
         return read_description(path, args, finder)
 
-    if not (is_installed(path) and finds_installed_only(finder)):
+    if not (resolve.is_installed(path) and resolve.finds_installed_only(finder)):
         return read()
     key = (path, finder.roots, dict(args))
     robot = kept_reading("robot", key, read, (*_ROBOT, *_GEOMETRIES))

@@ -7,14 +7,7 @@ from collections.abc import Collection, Iterable
 from lxml import etree
 
 from morphgen.errors import FormatError
-from morphgen.formats.rounding import (
-    INERTIA_NAMES,
-    format_inertia,
-    format_number,
-    format_numbers,
-    rounded_axis,
-    rounded_pose,
-)
+from morphgen.formats import rounding
 from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS, MeshUri
 from morphgen.model.geometry import Box, Geometry, Mesh, Pose, dimensions
 from morphgen.model.robot import Inertial, Joint, Link, Robot
@@ -120,8 +113,8 @@ def _write_link(model: etree._Element, link: Link, T_model_link: Pose, mesh_uri:
     etree.SubElement(inertial_element, "mass").text = f"{inertial.mass:.12g}"
     inertia_element = etree.SubElement(inertial_element, "inertia")
     inertia = inertial.inertia if any(inertial.inertia) else _MASSLESS.inertia
-    for name, value in zip(INERTIA_NAMES, inertia, strict=True):
-        etree.SubElement(inertia_element, name).text = format_inertia(value)
+    for name, value in zip(rounding.INERTIA_NAMES, inertia, strict=True):
+        etree.SubElement(inertia_element, name).text = rounding.format_inertia(value)
     for kind, shapes in (("visual", link.visuals), ("collision", link.collisions)):
         for i, shape in enumerate(shapes):
             holder = etree.SubElement(element, kind, name=f"{link.name}_{kind}_{i}")
@@ -130,18 +123,18 @@ def _write_link(model: etree._Element, link: Link, T_model_link: Pose, mesh_uri:
             if shape.rgba is not None and kind == "visual":
                 material = etree.SubElement(holder, "material")
                 for tag in ("ambient", "diffuse"):
-                    etree.SubElement(material, tag).text = format_numbers(shape.rgba)
+                    etree.SubElement(material, tag).text = rounding.format_numbers(shape.rgba)
 
 
 def _write_geometry(element: etree._Element, geometry: Geometry, mesh_uri: MeshUri) -> None:
     match geometry:
         case Box(size):
-            _write_values(element, "box", size=format_numbers(size))
+            _write_values(element, "box", size=rounding.format_numbers(size))
         case Mesh():
             _write_values(element, "mesh", uri=mesh_uri(geometry))
         case _:
             sizes = zip(("radius", "length"), dimensions(geometry), strict=False)
-            values = {name: format_number(size) for name, size in sizes}
+            values = {name: rounding.format_number(size) for name, size in sizes}
             _write_values(element, type(geometry).__name__.lower(), **values)
 
 
@@ -152,21 +145,25 @@ def _write_joint(model: etree._Element, joint: Joint, names: dict[str, str]) -> 
     if not joint.is_movable:
         return
     axis = etree.SubElement(element, "axis")
-    etree.SubElement(axis, "xyz").text = format_numbers(rounded_axis(joint))
+    etree.SubElement(axis, "xyz").text = rounding.format_numbers(rounding.rounded_axis(joint))
     if joint.mimic is not None:
         mimic = etree.SubElement(axis, "mimic", joint=names[joint.mimic.joint], axis="axis")
-        etree.SubElement(mimic, "multiplier").text = format_number(joint.mimic.multiplier)
-        etree.SubElement(mimic, "offset").text = format_number(joint.mimic.offset)
+        etree.SubElement(mimic, "multiplier").text = rounding.format_number(joint.mimic.multiplier)
+        etree.SubElement(mimic, "offset").text = rounding.format_number(joint.mimic.offset)
         # SDFormat's line is about a reference position of the leader.
         etree.SubElement(mimic, "reference").text = "0"
     lower, upper = (joint.limits if kind != "continuous" else None) or (None, None)
     bounds = {"lower": lower, "upper": upper}
     bounds |= {"effort": joint.effort or None, "velocity": joint.velocity or None}
-    texts = {name: format_number(value) for name, value in bounds.items() if value is not None}
+    texts = {
+        name: rounding.format_number(value) for name, value in bounds.items() if value is not None
+    }
     _write_values(axis, "limit", **texts)
     if joint.damping or joint.friction:
         dynamics = {"damping": joint.damping, "friction": joint.friction}
-        _write_values(axis, "dynamics", **{k: format_number(v) for k, v in dynamics.items()})
+        _write_values(
+            axis, "dynamics", **{k: rounding.format_number(v) for k, v in dynamics.items()}
+        )
 
 
 def _write_ends(element: etree._Element, parent: str, child: str) -> None:
@@ -181,6 +178,6 @@ def _write_values(parent: etree._Element, tag: str, **values: str) -> None:
 
 
 def _write_pose(element: etree._Element, pose: Pose) -> None:
-    text = f"{format_numbers(pose.position)} {format_numbers(rounded_pose(pose).rpy)}"
-    if text != "0 0 0 0 0 0":
-        etree.SubElement(element, "pose").text = text
+    xyz, rpy = map(rounding.format_numbers, (pose.position, rounding.rounded_pose(pose).rpy))
+    if (xyz, rpy) != ("0 0 0", "0 0 0"):
+        etree.SubElement(element, "pose").text = f"{xyz} {rpy}"

@@ -9,6 +9,7 @@ from graphlib import CycleError, TopologicalSorter
 from itertools import islice
 
 from morphgen.errors import CompositionError, GrammarError
+from morphgen.grammar import values
 from morphgen.grammar.compose import part_values, require_root
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import (
@@ -25,14 +26,6 @@ from morphgen.grammar.grammar_file import Grammar, find_grammar, load_grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.part import load_part
 from morphgen.grammar.syntax import MAX_COUNT, MAX_FAULTS, MAX_PARTS, MAX_SEARCH, Alternative, Item
-from morphgen.grammar.values import (
-    Distribution,
-    Draw,
-    Scope,
-    distribution_of,
-    evaluate,
-    typical_value,
-)
 
 _MANY = MAX_COUNT + 1  # stands for any larger number of structures
 
@@ -80,16 +73,16 @@ def enumerate_structures(grammar: Grammar, library: Library) -> Iterator[Derivat
                 )
 
 
-def _typical_scope(grammar: Grammar) -> Scope:
+def _typical_scope(grammar: Grammar) -> values.Scope:
     """Return a scope with typical values of all names and distributions."""
-    return Scope(_let_values(grammar, typical_value), typical_value, "")
+    return values.Scope(_let_values(grammar, values.typical_value), values.typical_value, "")
 
 
-def _let_values(grammar: Grammar, draw: Draw) -> dict[str, tuple[float, str]]:
+def _let_values(grammar: Grammar, draw: values.Draw) -> dict[str, tuple[float, str]]:
     """Return the value and the unit of every name defined by ``let``."""
     names: dict[str, tuple[float, str]] = {}
     for let in grammar.lets:
-        names[let.name] = evaluate(let.expression, Scope(names, draw, ""))
+        names[let.name] = values.evaluate(let.expression, values.Scope(names, draw, ""))
     return names
 
 
@@ -181,7 +174,7 @@ def _possible_alternatives(grammar: Grammar) -> dict[str, list[Alternative]]:
         production.symbol: [
             alternative
             for alternative in production.alternatives
-            if alternative.weight is None or evaluate(alternative.weight, scope)[0] > 0
+            if alternative.weight is None or values.evaluate(alternative.weight, scope)[0] > 0
         ]
         for production in grammar.productions
     }
@@ -192,10 +185,10 @@ MAX_CHECKED = 500
 MAX_CHECKED_INFINITE = 40  # the same limit for a grammar with infinitely many structures
 INNER_QUANTILE = 0.381966
 """Quantile of a test value that is neither a bound nor the middle; 1 - 1 / golden ratio."""
-_TESTED: tuple[Draw, ...] = (
+_TESTED: tuple[values.Draw, ...] = (
     lambda _, distribution: distribution.bounds[0],
     lambda _, distribution: distribution.bounds[1],
-    typical_value,
+    values.typical_value,
     # Neither a bound nor the middle, and no integer if it need not be one.
     lambda _, distribution: distribution.draw(lambda: INNER_QUANTILE, lambda: INNER_QUANTILE),
 )
@@ -207,7 +200,7 @@ class Variable:
     """A value that a grammar draws."""
 
     location: str  # `let NAME`, or the symbol, part and parameter, such as `ee: plane.size`
-    distribution: Distribution
+    distribution: values.Distribution
     text: str  # the distribution as written in the grammar
 
 
@@ -242,7 +235,7 @@ def variables(grammar: Grammar) -> list[Variable]:
         for name, expression in item.arguments
     ]
     return [
-        Variable(location, distribution_of(call, scope)[0], str(call))
+        Variable(location, values.distribution_of(call, scope)[0], str(call))
         for location, expression in expressions
         for call in expression.walk()
         if call.operator == "call"
@@ -253,7 +246,7 @@ def _item_faults(grammar: Grammar, library: Library) -> Iterator[str]:
     """Test all items with each distribution at its bounds, its typical and an inner value."""
     for draw in _TESTED:
         try:
-            scope = Scope(_let_values(grammar, draw), draw, "")
+            scope = values.Scope(_let_values(grammar, draw), draw, "")
         except GrammarError as error:
             yield str(error)
             return
@@ -265,7 +258,9 @@ def _item_faults(grammar: Grammar, library: Library) -> Iterator[str]:
             return
 
 
-def _faults_of(item: Item, grammar: Grammar, library: Library, scope: Scope) -> Iterator[str]:
+def _faults_of(
+    item: Item, grammar: Grammar, library: Library, scope: values.Scope
+) -> Iterator[str]:
     try:
         if grammar.production(item.name):
             require_no_arguments(item)

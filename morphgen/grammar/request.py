@@ -6,20 +6,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from morphgen.errors import CompositionError, GrammarError, nearest
+from morphgen.grammar import syntax
 from morphgen.grammar.analysis import load_sound_grammar
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import Chooser, derive
 from morphgen.grammar.grammar_file import SUFFIX, Grammar, grammar_names
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import MOUNT_YAW, Manifest, PartKind, parse_value, resolve_values
-from morphgen.grammar.syntax import (
-    MAX_WORD,
-    Expression,
-    Item,
-    Production,
-    SourceLocation,
-    parse_condition,
-)
 from morphgen.grammar.values import Scope, evaluate, typical_value
 
 
@@ -52,15 +45,17 @@ def _pin_parameter(grammar: Grammar, part: str, name: str, value: str, library: 
     if name not in parameters:
         raise GrammarError(f"{part!r} has no parameter {name!r}{nearest(name, parameters)}")
     pinned_value = parse_value(value, parameters[name], f"{part}.{name}")
-    number = Expression("number", (), SourceLocation("command line", 1, 1), "", pinned_value)
+    number = syntax.Expression(
+        "number", (), syntax.SourceLocation("command line", 1, 1), "", pinned_value
+    )
 
-    def pinned(item: Item) -> Item:
+    def pinned(item: syntax.Item) -> syntax.Item:
         if item.name != part:
             return item
         other_arguments = tuple(entry for entry in item.arguments if entry[0] != name)
         return replace(item, arguments=(*other_arguments, (name, number)))
 
-    def with_pinned(production: Production) -> Production:
+    def with_pinned(production: syntax.Production) -> syntax.Production:
         alternatives = (
             replace(alternative, items=tuple(map(pinned, alternative.items)))
             for alternative in production.alternatives
@@ -81,7 +76,7 @@ def dotted_keys(owners: Iterable[tuple[str, Manifest]]) -> Iterator[str]:
 
 
 def _pin_let(grammar: Grammar, name: str, value: str) -> Grammar:
-    number = parse_condition(value, f"{name}={value}")
+    number = syntax.parse_condition(value, f"{name}={value}")
     unsigned = number.operands[0] if number.operator == "negative" else number
     if unsigned.operator != "number":
         raise GrammarError(f"{name}={value}: not a number, such as 0.02 or 20mm")
@@ -97,7 +92,7 @@ def _pin_symbol(grammar: Grammar, symbol: str, value: str, library: Library) -> 
         manifests = (library.manifest(part) for part in _parts(grammar))
         hint = nearest(symbol, valid, dotted_keys((each.name, each) for each in manifests))
         raise GrammarError(f"{symbol}={value}: no symbol {symbol!r}{hint}")
-    if value.isdecimal() and len(value) <= MAX_WORD:
+    if value.isdecimal() and len(value) <= syntax.MAX_WORD:
         pinned = _with_count(production, int(value))
     else:
         alternatives = tuple(a for a in production.alternatives if a.items[0].name == value)
@@ -111,7 +106,7 @@ def _pin_symbol(grammar: Grammar, symbol: str, value: str, library: Library) -> 
     return replace(grammar, productions=tuple(productions))
 
 
-def _with_count(production: Production, count: int) -> Production:
+def _with_count(production: syntax.Production, count: int) -> syntax.Production:
     """Fix the count of the one open repetition of a symbol; drop its other alternatives."""
     repetitions = [
         (alternative, item, item.repetition)

@@ -21,7 +21,7 @@ from morphgen.checks import check, rules
 from morphgen.checks.rules import check_links_apart
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import FormatError, PartError
-from morphgen.formats import description
+from morphgen.formats import resolve
 from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.xacro.expand import Expansion
 from morphgen.grammar.library import default_library
@@ -57,7 +57,7 @@ def real(tmp_path, monkeypatch):
     def make(**changes):
         urdf = tmp_path / "pincer.urdf"
         urdf.write_bytes(Expansion({}, urdf, PackageFinder()).run(PINCER.encode()))
-        monkeypatch.setattr(description, "distribution_file", lambda package, file: tmp_path / file)
+        monkeypatch.setattr(resolve, "distribution_file", lambda package, file: tmp_path / file)
         source = {"source": {"package": "rtb-data", "file": "pincer.urdf"}}
         tool = {"link": "palm", "xyz": [0, 0, 0.25]}
         manifest = write_part(tmp_path, **GONE | source | {"tool": tool} | changes)

@@ -13,15 +13,8 @@ import numpy as np
 from lxml import etree
 
 from morphgen.errors import FormatError, shortened
+from morphgen.formats import resolve
 from morphgen.formats.data_files import read_bytes
-from morphgen.formats.resolve import (
-    SKIP_HINT,
-    FoundFile,
-    PackageFinder,
-    default_finder,
-    find_file,
-    package_source,
-)
 from morphgen.formats.rounding import INERTIA_NAMES
 from morphgen.formats.urdf.schema import CHILDREN, above_free_base, structure_findings
 from morphgen.formats.urdf.write import MORPHGEN_TAG, joined_capsules
@@ -67,7 +60,7 @@ class UnsoundError(FormatError):
 def read_urdf(
     path: Path,
     args: Mapping[str, str] | None = None,
-    finder: PackageFinder | None = None,
+    finder: resolve.PackageFinder | None = None,
     *,
     keep_order: bool = False,
     written_frames: bool = False,
@@ -78,12 +71,12 @@ def read_urdf(
     else zero, or the middle of a range without zero.
     """
     require_description_file(path)
-    finder = finder or default_finder()
+    finder = finder or resolve.default_finder()
     data = urdf_bytes(path, args or {}, finder)
     return robot_from_xml(data, path, finder, keep_order=keep_order, written_frames=written_frames)
 
 
-def urdf_bytes(path: Path, args: Mapping[str, str], finder: PackageFinder) -> bytes:
+def urdf_bytes(path: Path, args: Mapping[str, str], finder: resolve.PackageFinder) -> bytes:
     """Return the content of a URDF, or of a xacro (by its suffix) when expanded."""
     if path.suffix == ".xacro":
         from morphgen.formats.xacro.expand import expand  # loads xacro and minidom
@@ -113,7 +106,7 @@ def require_description_file(path: Path) -> None:
 def robot_from_xml(
     data: bytes,
     path: Path,
-    finder: PackageFinder,
+    finder: resolve.PackageFinder,
     *,
     trusted: bool = False,
     keep_order: bool = False,
@@ -193,13 +186,13 @@ def _written_home(root: etree._Element, origin: str) -> dict[str, float]:
 
 
 def resolved_meshes(
-    root: etree._Element, path: Path, finder: PackageFinder
+    root: etree._Element, path: Path, finder: resolve.PackageFinder
 ) -> tuple[dict[str, Path], list[dict[str, str]], list[Finding]]:
     """Return the files of all meshes by URI, the installed packages that they are of, and findings.
 
     Shapes without a file are removed, if the finder skips them.
     """
-    known: dict[str, FoundFile] = {}
+    known: dict[str, resolve.FoundFile] = {}
     missing: dict[str, Finding] = {}
     for element in root.iterfind(f"link/*/{_MESH}"):
         uri = element.get("filename", "")
@@ -208,7 +201,7 @@ def resolved_meshes(
         try:
             known[uri] = _find_mesh(uri, root, path, finder)
         except FormatError as error:
-            where, hint = f"{path}:{element.sourceline}", f", {SKIP_HINT}"
+            where, hint = f"{path}:{element.sourceline}", f", {resolve.SKIP_HINT}"
             missing[uri] = found("mesh-unresolved", where, error=error, hint=hint)
     if missing and not finder.skip_missing:
         raise UnsoundError(str(path), list(missing.values()))
@@ -230,10 +223,12 @@ def resolved_meshes(
     return files, packages, findings
 
 
-def _find_mesh(uri: str, root: etree._Element, path: Path, finder: PackageFinder) -> FoundFile:
+def _find_mesh(
+    uri: str, root: etree._Element, path: Path, finder: resolve.PackageFinder
+) -> resolve.FoundFile:
     """Find a mesh as written, else as MuJoCo does by ``<mujoco><compiler>``."""
     try:
-        return find_file(uri, path, finder)
+        return resolve.find_file(uri, path, finder)
     except FormatError:
         compiler = root.find("mujoco/compiler")
         if compiler is None:
@@ -243,15 +238,15 @@ def _find_mesh(uri: str, root: etree._Element, path: Path, finder: PackageFinder
         inside = name if compiler.get("strippath") == "false" else name.name
         with suppress(FormatError):
             folder = compiler.get("meshdir", "").replace("\\", "/")
-            return find_file((PurePosixPath(folder) / inside).as_posix(), path, finder)
+            return resolve.find_file((PurePosixPath(folder) / inside).as_posix(), path, finder)
         raise
 
 
 def _place_findings(
-    known: Mapping[str, FoundFile], origin: str
+    known: Mapping[str, resolve.FoundFile], origin: str
 ) -> tuple[list[dict[str, str]], list[Finding]]:
     """Return the installed packages of files, and findings about unexpected places, by package."""
-    groups: dict[tuple[str, str], list[FoundFile]] = {}
+    groups: dict[tuple[str, str], list[resolve.FoundFile]] = {}
     for file in known.values():
         if file.place:
             groups.setdefault((file.place, file.package), []).append(file)
@@ -259,7 +254,7 @@ def _place_findings(
     for (place, package), files in groups.items():
         values = {"package": package, "count": len(files), "example": files[0].path}
         if place == "installed":
-            source = package_source(files[0])
+            source = resolve.package_source(files[0])
             packages.append({"package": package, **source})
             findings.append(found("mesh-from-package", origin, **values, **source))
         else:

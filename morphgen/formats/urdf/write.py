@@ -8,14 +8,7 @@ from math import dist
 from lxml import etree
 
 from morphgen.errors import FormatError
-from morphgen.formats.rounding import (
-    INERTIA_NAMES,
-    format_inertia,
-    format_number,
-    format_numbers,
-    rounded_axis,
-    rounded_pose,
-)
+from morphgen.formats import rounding
 from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Pose, Shape, Sphere
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Inertial, Joint, Link, Robot
 
@@ -112,7 +105,7 @@ def _write_morphgen_element(root: etree._Element, robot: Robot) -> None:
         return
     element = etree.SubElement(root, MORPHGEN_TAG)
     for row, position in zip(robot.independent_joints, robot.home, strict=True):
-        home = {"joint": robot.joints[row].name, "position": format_number(position)}
+        home = {"joint": robot.joints[row].name, "position": rounding.format_number(position)}
         etree.SubElement(element, "home", home)
     for frame in robot.frames:
         etree.SubElement(element, "frame", name=frame.name)
@@ -123,8 +116,10 @@ def _write_link(root: etree._Element, link: Link, mesh_uri: MeshUri) -> None:
     inertial = link.inertial or Inertial(0.0)
     inertial_element = etree.SubElement(element, "inertial")
     _write_origin(inertial_element, Pose(inertial.com))
-    etree.SubElement(inertial_element, "mass", value=format_number(inertial.mass))
-    values = zip(INERTIA_NAMES, map(format_inertia, inertial.inertia), strict=True)
+    etree.SubElement(inertial_element, "mass", value=rounding.format_number(inertial.mass))
+    values = zip(
+        rounding.INERTIA_NAMES, map(rounding.format_inertia, inertial.inertia), strict=True
+    )
     etree.SubElement(inertial_element, "inertia", dict(values))
     for kind, shapes in (("visual", link.visuals), ("collision", link.collisions)):
         pieces = ((whole, piece) for whole in shapes for piece in urdf_pieces(whole))
@@ -134,14 +129,14 @@ def _write_link(root: etree._Element, link: Link, mesh_uri: MeshUri) -> None:
             _write_origin(holder, shape.T_link_shape)
             _write_geometry(etree.SubElement(holder, "geometry"), shape.geometry, mesh_uri)
             if shape.rgba is not None and kind == "visual":
-                colour = format_numbers(shape.rgba)
+                colour = rounding.format_numbers(shape.rgba)
                 material = etree.SubElement(holder, "material", name=f"{link.name}_material_{i}")
                 etree.SubElement(material, "color", rgba=colour)
 
 
 def _write_origin(element: etree._Element, pose: Pose) -> None:
-    xyz = format_numbers(pose.position)
-    rpy = format_numbers(rounded_pose(pose).rpy)
+    xyz = rounding.format_numbers(pose.position)
+    rpy = rounding.format_numbers(rounding.rounded_pose(pose).rpy)
     if (xyz, rpy) != ("0 0 0", "0 0 0"):
         etree.SubElement(element, "origin", xyz=xyz, rpy=rpy)
 
@@ -149,9 +144,9 @@ def _write_origin(element: etree._Element, pose: Pose) -> None:
 def _write_geometry(element: etree._Element, geometry: Geometry, mesh_uri: MeshUri) -> None:
     match geometry:
         case Box(size):
-            etree.SubElement(element, "box", size=format_numbers(size))
+            etree.SubElement(element, "box", size=rounding.format_numbers(size))
         case Sphere(radius):
-            etree.SubElement(element, "sphere", radius=format_number(radius))
+            etree.SubElement(element, "sphere", radius=rounding.format_number(radius))
         case Cylinder(radius, length):
             etree.SubElement(element, "cylinder", _texts({"radius": radius, "length": length}))
         case Mesh():
@@ -168,7 +163,7 @@ def _write_joint(root: etree._Element, joint: Joint) -> None:
     etree.SubElement(element, "child", link=joint.child)
     if not joint.is_movable:
         return
-    etree.SubElement(element, "axis", xyz=format_numbers(rounded_axis(joint)))
+    etree.SubElement(element, "axis", xyz=rounding.format_numbers(rounding.rounded_axis(joint)))
     effort = DEFAULT_EFFORT if joint.effort is None else joint.effort
     velocity = DEFAULT_VELOCITY if joint.velocity is None else joint.velocity
     limit = {"effort": effort, "velocity": velocity}
@@ -188,4 +183,4 @@ def _write_joint(root: etree._Element, joint: Joint) -> None:
 
 
 def _texts(values: Mapping[str, float]) -> dict[str, str]:
-    return {name: format_number(value) for name, value in values.items()}
+    return {name: rounding.format_number(value) for name, value in values.items()}
