@@ -357,8 +357,9 @@ def token_shapes(robot: Robot, folders: Sequence[Path] = ()) -> dict[str, Shape]
         )
     for done, (name, shapes, path) in enumerate(missing):
         report(done, len(missing))
-        primitives[name] = fit_primitive(shapes)
-        _write_cached(path, primitives[name], fits.shapes_scale(shapes))
+        primitives[name] = shape = fit_primitive(shapes)
+        unit_shape = shape and scale_shape(shape, 1 / fits.shapes_scale(shapes))
+        keep_file(path, json.dumps(unit_shape and fits.shape_to_data(unit_shape)), "fits")
     if missing:
         report(len(missing), len(missing))
     return {name: shape for name, shape in primitives.items() if shape}
@@ -400,8 +401,3 @@ def _read_cached(path: Path, scale: float) -> Shape | None:
     except FormatError as error:
         raise FormatError(f"{error}; delete the file") from error
     return None if record is None else scale_shape(record.shape, scale)
-
-
-def _write_cached(path: Path, shape: Shape | None, scale: float) -> None:
-    data = None if shape is None else fits.shape_to_data(scale_shape(shape, 1 / scale))
-    keep_file(path, json.dumps(data), "fits")

@@ -41,7 +41,7 @@ let: "let" NAME "=" sum
 where: "where" or_
 production: NAME _ARROW alternative ("|" alternative)*
 alternative: [weight] item+
-weight: _WEIGHT "(" sum ")"
+?weight: _WEIGHT "(" sum ")"
 item: [NAME ":"] NAME ["(" [argument ("," argument)*] ")"] [repetition]
 argument: NAME "=" sum
 repetition: "{" INT ["," INT] "}"
@@ -300,9 +300,6 @@ class _Builder(Transformer_NonRecursive[Token, Any]):
         what = f"{location}: {len(alternatives):,} alternatives of {str(symbol)!r}"
         require_at_most(len(alternatives), MAX_ALTERNATIVES, what)
         return Production(str(symbol), alternatives, location)
-
-    def weight(self, expression: Expression) -> Expression:
-        return expression
 
     def alternative(self, weight: Expression | None, *items: Item) -> Alternative:
         return Alternative(items, weight)

@@ -66,7 +66,8 @@ class Pose:
 
     def inverse(self) -> Pose:
         """Return ``T_b_a`` for ``T_a_b``."""
-        inverse = rotation.conjugate(self.quaternion)
+        w, i, j, k = self.quaternion
+        inverse = (w, -i, -j, -k)
         x, y, z = rotation.rotate(inverse, self.position)
         return Pose((-x, -y, -z), rotation.normalize(inverse))
 

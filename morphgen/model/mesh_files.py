@@ -11,6 +11,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -375,19 +376,15 @@ def _materials(libraries: list[str], used: set[str], files: scene_files.FolderRe
     """Return the materials of all libraries that an OBJ file names, with readable textures only."""
     texts = []
     for line in dict.fromkeys(libraries):
-        try:
+        with suppress(OSError, ValueError):
             texts.append(files.get(line))  # a name may have spaces
-        except (OSError, ValueError) as whole:
-            names = line.split()
-            for name in names:
-                try:
-                    texts.append(files.get(name))
-                except (OSError, ValueError) as error:
-                    reason = whole if len(names) == 1 else error
-                    missing = isinstance(reason, FileNotFoundError)
-                    files.left_out.append(
-                        f"material file {name!r}: {'no such file' if missing else reason}"
-                    )
+            continue
+        for name in line.split():
+            try:
+                texts.append(files.get(name))
+            except (OSError, ValueError) as error:
+                why = "no such file" if isinstance(error, FileNotFoundError) else error
+                files.left_out.append(f"material file {name!r}: {why}")
     lines = []
     known: set[str] = set()
     name = ""

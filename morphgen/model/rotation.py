@@ -41,11 +41,6 @@ def multiply(a: Quat, b: Quat) -> Quat:
     )
 
 
-def conjugate(q: Quat) -> Quat:
-    """Return the inverse rotation."""
-    return (q[0], -q[1], -q[2], -q[3])
-
-
 def rotate(q: Quat, v: Vec3) -> Vec3:
     """Rotate a vector by a unit quaternion."""
     w, x, y, z = q

@@ -132,10 +132,9 @@ class FolderResolver(trimesh.resolvers.Resolver):
                 self._pixels_left -= width * height
             if self._pixels_left < 0:
                 raise ValueError(f"the textures have more than {MAX_PIXELS} pixels")
-        except FileNotFoundError:
-            self.left_out.append(f"texture {name!r}: no such file")
         except (OSError, LookupError, TypeError, ValueError) as error:
-            self.left_out.append(f"texture {name!r}: {error}")
+            why = "no such file" if isinstance(error, FileNotFoundError) else error
+            self.left_out.append(f"texture {name!r}: {why}")
         else:
             return True
         return False

@@ -94,7 +94,7 @@ def read_document(path: Path, finder: PackageFinder, *, with_options: bool = Fal
         root.get("model") or path.stem,
         etree.tostring(root, encoding="unicode"),
         meshes,
-        includes.files,
+        tuple(sorted(includes.seen - {path.resolve()})),
         tuple(replace(f, where=f"{path.name}{f.where.removeprefix(where)}") for f in findings),
     )
 
@@ -105,13 +105,8 @@ class _Includes:
     def __init__(self, main: Path, finder: PackageFinder) -> None:
         self._main = main
         self._finder = finder
-        self._seen: set[Path] = set()
+        self.seen: set[Path] = set()  # files read so far, links resolved
         self._bytes_left = MAX_MJCF_BYTES
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        """Files read so far, links resolved, besides the main one."""
-        return tuple(sorted(self._seen - {self._main.resolve()}))
 
     def read(self, path: Path, depth: int) -> tuple[etree._Element, tuple[Finding, ...]]:
         """Return the root of a file with its includes inserted, and what was repaired."""
@@ -139,13 +134,13 @@ class _Includes:
 
     def _require_bounded(self, path: Path, depth: int) -> None:
         real = path.resolve()
-        if real in self._seen:
+        if real in self.seen:
             raise FormatError(f"{path}: is included twice; MJCF includes a file once")
         if depth > MAX_DEPTH:
             raise FormatError(f"{path}: includes are nested deeper than {MAX_DEPTH} levels")
-        if len(self._seen) > MAX_INCLUDES:
+        if len(self.seen) > MAX_INCLUDES:
             raise FormatError(f"{self._main}: includes more than {MAX_INCLUDES} files")
-        self._seen.add(real)
+        self.seen.add(real)
 
     def _file(self, element: etree._Element, includer: Path) -> Path:
         where = f"{includer}:{element.sourceline}"

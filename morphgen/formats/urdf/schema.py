@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import chain
-from typing import Any, TypeAlias
+from typing import Any
 
 from lxml import etree
 
@@ -97,12 +96,11 @@ def counted_elements(elements: Sequence[etree._Element], name: str, parent: str)
 def content_findings(element: etree._Element) -> Iterator[Finding]:
     """Check an element and everything that is read inside it."""
     tag = element.tag
-    checks = [
-        _number_faults(element, attribute) if attribute.counts else _text_faults(element, attribute)
-        for attribute in _SCHEMA.attributes.get(tag, ())
-    ]
-    for row, values in chain(*checks, _missing_faults(element), _rotation_faults(element)):
-        yield _finding(element, row, **values)
+    for attribute in _SCHEMA.attributes.get(tag, ()):
+        check = _number_findings if attribute.counts else _text_findings
+        yield from check(element, attribute)
+    yield from _missing_findings(element)
+    yield from _rotation_findings(element)
     if tag == "geometry":
         yield from _geometry_findings(element)
     # `_robot_findings` checks the children of <robot>.
@@ -115,26 +113,23 @@ def content_findings(element: etree._Element) -> Iterator[Finding]:
             yield from content_findings(child)
 
 
-_Fault: TypeAlias = tuple[str, Mapping[str, object]]  # row of a finding about an element, values
-
-
-def _text_faults(element: etree._Element, attribute: Attribute) -> Iterator[_Fault]:
+def _text_findings(element: etree._Element, attribute: Attribute) -> Iterator[Finding]:
     tag, name = element.tag, attribute.name
     value = element.get(name, "")
     if not attribute.required:
         return
     if len(value) > MAX_TEXT or not value.isprintable():
-        text = shortened(value)
-        yield "text-invalid", {"tag": tag, "name": name, "text": text, "most": MAX_TEXT}
+        values = {"text": shortened(value), "most": MAX_TEXT}
+        yield _finding(element, "text-invalid", tag=tag, name=name, **values)
     if not value.strip():
-        yield "attribute-missing", {"tag": tag, "name": name, "others": ""}
+        yield _finding(element, "attribute-missing", tag=tag, name=name, others="")
 
 
-def _missing_faults(element: etree._Element) -> Iterator[_Fault]:
+def _missing_findings(element: etree._Element) -> Iterator[Finding]:
     tag = element.tag
     for name, repair in _SCHEMA.expected.get(tag, {}).items():
         if element.find(name) is None:
-            yield "element-missing", {"tag": tag, "name": name, "repair": repair}
+            yield _finding(element, "element-missing", tag=tag, name=name, repair=repair)
 
 
 def _geometry_findings(element: etree._Element) -> Iterator[Finding]:
@@ -153,47 +148,48 @@ def _geometry_findings(element: etree._Element) -> Iterator[Finding]:
         yield _finding(known[1], "element-repeated/geometry", count=len(known))
 
 
-def _number_faults(element: etree._Element, attribute: Attribute) -> Iterator[_Fault]:
+def _number_findings(element: etree._Element, attribute: Attribute) -> Iterator[Finding]:
     name, counts = attribute.name, attribute.counts
     text = element.get(name)
     if text is None:
         if attribute.required:
             values = {"tag": element.tag, "name": name, "others": _others(element)}
-            yield "attribute-missing", values
+            yield _finding(element, "attribute-missing", **values)
         return
     shown = f'<{element.tag} {name}="{shortened(text)}">'
     words = text.replace(",", " ").split() if max(counts) > 1 else text.split()
     wrong = [w for w in words if not (_DECIMAL.fullmatch(w) and math.isfinite(float(w)))]
     if wrong:
-        yield "number-malformed", {"shown": shown, "word": shortened(wrong[0])}
+        yield _finding(element, "number-malformed", shown=shown, word=shortened(wrong[0]))
         return
     if len(words) not in counts:
         surplus = name == "scale" and len(words) > max(counts)  # some exporters write them
         expected = {"counts": " or ".join(map(str, counts)), "most": max(counts)}
         fault = {"shown": shown, "count": len(words), "repairable": surplus}
-        yield "number-count", fault | expected
+        yield _finding(element, "number-count", **fault, **expected)
         if not surplus:
             return
         words = words[: max(counts)]
     if "," in text:
-        yield "number-commas", {"shown": shown, "repairable": name in _WITH_COMMAS}
+        yield _finding(element, "number-commas", shown=shown, repairable=name in _WITH_COMMAS)
     numbers = [float(word) for word in words]
     is_short = attribute.positive and 0 < min(numbers) < MIN_LENGTH
     if max(map(abs, numbers)) > MAX_NUMBER or is_short:
-        yield "number-absurd", {"shown": shown, "most": MAX_NUMBER, "least": MIN_LENGTH}
+        values = {"shown": shown, "most": MAX_NUMBER, "least": MIN_LENGTH}
+        yield _finding(element, "number-absurd", **values)
     if attribute.positive and min(numbers) <= 0:
-        yield "size-not-positive", {"shown": shown, "repairable": min(numbers) == 0}
+        yield _finding(element, "size-not-positive", shown=shown, repairable=min(numbers) == 0)
     if name == "scale" and 0.0 in numbers:
-        yield "mesh-scale-invalid", {"shown": shown}
+        yield _finding(element, "mesh-scale-invalid", shown=shown)
 
 
-def _rotation_faults(element: etree._Element) -> Iterator[_Fault]:
+def _rotation_findings(element: etree._Element) -> Iterator[Finding]:
     quaternion = element.get("quat_xyzw", "1").split()
     if element.tag == "origin" and (
         (element.get("rpy") and element.get("quat_xyzw"))
         or not any(float(w) for w in quaternion if _DECIMAL.fullmatch(w))
     ):
-        yield "rotation-invalid", {}
+        yield _finding(element, "rotation-invalid")
 
 
 def _others(element: etree._Element) -> str:
