@@ -19,7 +19,6 @@ from morphgen.typing import Array
 from morphgen.viewer.app.address import AddressError, parse_count
 from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.robot_rows import folder_rows, robot_folders, split_rows
-from morphgen.viewer.robot_tables import has_tool
 from morphgen.viewer.robot_uri import WORDS, FileAccess, member_split, parent_folder, resolve_split
 
 
@@ -79,7 +78,7 @@ def joint_roles(robot: Robot) -> list[str]:
     Others, such as ``finger 1``, do not.
     """
     on_path: tuple[int, ...] = ()
-    if has_tool(robot):
+    if robot.tool:
         on_path = driving_joints(robot, robot.joint_chain(robot.frame(TOOL).link))
     off_path = [i for i in range(robot.dof) if i not in on_path]
     roles = {i: f"joint {n}" for n, i in enumerate(on_path, 1)}

@@ -26,7 +26,6 @@ from morphgen.model.robot import Robot
 from morphgen.model.scene_files import read_picture
 from morphgen.viewer.app.address import AddressError
 from morphgen.viewer.app.session import Session
-from morphgen.viewer.robot_tables import has_tool
 from morphgen.viewer.robot_uri import FileAccess, UriError, content_hash, read_robot_uri, uri_name
 
 SIZE = (240, 180)  # largest width and height of a thumbnail [pixels]
@@ -104,7 +103,7 @@ def _draw_thumbnail(uri: str, files: FileAccess) -> Thumbnail:
     facts: dict[str, object] = {
         "dof": stats.dof,
         "links": stats.links,
-        "reach": stats.reach if has_tool(robot) and stats.dof else None,
+        "reach": stats.reach if robot.tool and stats.dof else None,
         "mass": stats.mass,
         "findings": tuple(sorted(findings)),
     }

@@ -15,7 +15,7 @@ from morphgen.benchmark.licences import find_licence
 from morphgen.formats.ros_package import part_licences
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh, Shape, dimensions
-from morphgen.model.robot import TOOL, Joint, Link, Robot
+from morphgen.model.robot import Joint, Link, Robot
 from morphgen.viewer import markup
 
 _UNITS = {"prismatic": ("m", "N", "m/s")}  # units of position, effort, velocity
@@ -29,11 +29,6 @@ class JointGroup:
     label: str  # label of the part, which begins the names of its joints; empty for unknown parts
     title: str  # label and name of the part, such as `left_arm (ur5)`, or the one that both are
     rows: tuple[int, ...]  # indices of the joints in q
-
-
-def has_tool(robot: Robot) -> bool:
-    """Return whether a robot has a tool frame."""
-    return any(frame.name == TOOL for frame in robot.frames)
 
 
 def joint_groups(robot: Robot) -> list[JointGroup]:
@@ -108,9 +103,9 @@ def link_table(robot: Robot) -> str:
     """Return the indented tree of links: joint above the link, mass and shapes."""
     depth = [0] * len(robot.links)
     rows = []
-    tool = next((frame.link for frame in robot.frames if frame.name == TOOL), None)
+    tool = robot.tool and robot.tool.link
     for i, link in enumerate(robot.links):
-        shapes = link.collisions or link.visuals
+        shapes = link.solid_shapes
         kinds = Counter(type(shape.geometry).__name__.lower() for shape in shapes)
         counts = ", ".join(kind if n == 1 else f"{n} {kind}" for kind, n in kinds.items())
         joint = robot.joints[i - 1] if i else None

@@ -13,7 +13,6 @@ from morphgen.model.geometry import Geometry, Mesh, Pose, dimensions
 from morphgen.model.robot import (
     DEFAULT_EFFORT,
     DEFAULT_VELOCITY,
-    TOOL,
     Inertial,
     Joint,
     Link,
@@ -40,7 +39,7 @@ def robot_hash(robot: Robot, *, visuals: bool = True) -> str:
     visuals: Include visual shapes. Without them, and with primitives as collision shapes, the hash
     does not depend on how meshes are stored.
     """
-    tool = next((frame for frame in robot.frames if frame.name == TOOL), None)
+    tool = robot.tool
     tool_frame = None if tool is None else [robot.link_index[tool.link], _pose(tool.T_link_frame)]
     joints = [_joint(joint, robot) for joint in robot.joints]
     links = [_link(link if visuals else replace(link, visuals=())) for link in robot.links]

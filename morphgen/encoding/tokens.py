@@ -204,7 +204,7 @@ def tokens(
             )
     robot = as_written(robot)  # rounded as in its file: composed and read back, the same tokens
     codes = encode_joint_positions(robot, robot.home if q is None else q)
-    tool = next((frame.link for frame in robot.frames if frame.name == TOOL), None)
+    tool = robot.tool and robot.tool.link
     static = np.zeros((len(robot.links), TOKEN_SIZE))  # all fields but the joint position
     static[:, INDEX.start] = np.arange(len(robot.links)) / (max_links - 1)
     static[:, PARENT.start] = np.array(robot.parents) / (max_links - 1)

@@ -29,7 +29,7 @@ from morphgen.formats.picture import gl_context
 from morphgen.model.geometry import Pose
 from morphgen.model.inertia import bounding_box, box_corners
 from morphgen.model.kinematics import forward_kinematics, movable_positions
-from morphgen.model.robot import TOOL, Robot
+from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.registry import TASKS
@@ -271,8 +271,7 @@ class Renderer:
                 add_shape(base, shape).rgba = shape.rgba or _OBSTACLE
         for marker in markers:
             bodies[marker.name] = _add_marker(spec, marker)
-        if any(frame.name == TOOL for frame in scene.robot.frames):
-            tool = scene.robot.frame(TOOL)
+        if tool := scene.robot.tool:
             T_link_camera = Pose.from_matrix(tool.T_link_frame.matrix @ WRIST.matrix)
             spec.body(tool.link).add_camera(
                 name="wrist",

@@ -90,12 +90,12 @@ class ArticulatedObject:
 
         The position of the object's state is that of this point.
         """
-        frames = [frame for frame in self.body.frames if frame.name == TOOL]
-        if not frames:
+        tool = self.body.tool
+        if tool is None:
             return (0.0, 0.0, 0.0)
-        T_root_link = self._poses[self.body.link_index[frames[0].link]]
+        T_root_link = self._poses[self.body.link_index[tool.link]]
         T_joint_root = self.joint.T_parent_joint.inverse()
-        return (T_joint_root @ T_root_link @ frames[0].T_link_frame).position
+        return (T_joint_root @ T_root_link @ tool.T_link_frame).position
 
     @cached_property
     def contact_shapes(self) -> tuple[Shape, ...]:
@@ -160,8 +160,7 @@ class ArticulatedObject:
     @property
     def _contact_link(self) -> str:
         """Link of the contact point."""
-        links = [frame.link for frame in self.body.frames if frame.name == TOOL]
-        return links[0] if links else self.joint.child
+        return self.body.tool.link if self.body.tool else self.joint.child
 
     @property
     def _moving_links(self) -> set[str]:

@@ -38,7 +38,7 @@ from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.pages.robot import PANEL_WIDTH, summary
 from morphgen.viewer.robot_files import new_bundle_files, zip_files
-from morphgen.viewer.robot_tables import has_tool, part_title, slider_step
+from morphgen.viewer.robot_tables import part_title, slider_step
 from morphgen.viewer.robot_uri import (
     DEFAULT_WORDS,
     DERIVATION,
@@ -577,7 +577,7 @@ class ComposePage:
     def _check(self) -> None:
         """Check the current robot, and show the findings unless another robot has replaced it."""
         if (shown := self.shown) is not None:
-            findings = check(shown.robot, tool_required=has_tool(shown.robot))
+            findings = check(shown.robot, tool_required=shown.robot.tool is not None)
             if shown is self.shown:
                 table = markup.findings_table(findings, self._session.files.redact)
                 self._findings.content = markup.framed(table)
@@ -663,7 +663,7 @@ def change_text(before: Robot, after: Robot) -> str:
     parts = []
     if before.dof != after.dof:
         parts.append(f"{before.dof} to {after.dof} DoF")
-    if all(has_tool(robot) and robot.dof for robot in (before, after)):
+    if all(robot.tool and robot.dof for robot in (before, after)):
         old, new = (f"{arm_reach(robot):.2f}" for robot in (before, after))
         if old != new:
             parts.append(f"reach {old} to {new} m")

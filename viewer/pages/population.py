@@ -41,7 +41,6 @@ from morphgen.viewer.app.workers import Workers
 from morphgen.viewer.controls import RoleSliders, all_roles, bind, joint_roles
 from morphgen.viewer.pages.gallery import show_index
 from morphgen.viewer.robot_rows import UNITS, Row, facts_line, folder_rows, sort_rows, split_rows
-from morphgen.viewer.robot_tables import has_tool
 from morphgen.viewer.scene import stage
 from morphgen.viewer.scene.robot import robot_bounds
 
@@ -360,7 +359,7 @@ def _measured(row: Row, robot: Robot) -> Row:
     facts: dict[str, object] = {}
     if row.dof is None:
         facts |= {"dof": robot.dof, "links": len(robot.links), "mass": robot.mass}
-    if row.reach is None and has_tool(robot) and robot.dof:
+    if row.reach is None and robot.tool and robot.dof:
         facts["reach"] = reach(robot)
     return replace(row, **facts)  # type: ignore[arg-type]
 

@@ -36,7 +36,6 @@ from morphgen.viewer.app.workers import named
 from morphgen.viewer.controls import bind
 from morphgen.viewer.robot_files import bundle_files, zip_files
 from morphgen.viewer.robot_rows import neighbour_uris
-from morphgen.viewer.robot_tables import has_tool
 from morphgen.viewer.scene import overlays as scene_overlays
 from morphgen.viewer.scene import robot as scene_robot
 from morphgen.viewer.scene import stage as scene_stage
@@ -62,7 +61,7 @@ def show(session: Session) -> None:
 
 def summary(robot: Robot, links: str) -> str:
     """Return a robot's name and facts, followed by links as HTML."""
-    distance = kinematics.arm_reach(robot) if has_tool(robot) and robot.dof else None
+    distance = kinematics.arm_reach(robot) if robot.tool and robot.dof else None
     facts = robot_tables.summary(robot, distance)
     return markup.framed(
         f"<h3>{escape(robot.name)}</h3>",
@@ -93,11 +92,11 @@ def _links(robot: Robot, uri: str) -> str:
         target = Address("compose", (uri.removeprefix(robot_uri.WORDS),))
         links.append(markup.link(target, "Edit in Compose"))
     links.append(markup.link(Address("compare", (uri,)), "compare"))
-    if has_tool(robot) and robot.dof:
+    if robot.tool and robot.dof:
         play = (markup.link(Address("play", (task,), robots=(uri,)), task) for task in TASKS)
         links.append(f"see it {' · '.join(play)}")
     reasons = [] if robot.provenance.get("derivation") else ["Compose: it is not made of parts"]
-    if not has_tool(robot):
+    if robot.tool is None:
         reasons.append(f"{' and '.join(TASKS)}: no link has the name {TOOL}")
     elif not robot.dof:
         reasons.append(f"{' and '.join(TASKS)}: no joint moves")
@@ -296,7 +295,7 @@ class RobotPage:
         """Show the findings of the checks, and build the self-collision checker."""
         session, redact = self.session, self.session.files.redact
         with session.activity("checking"):
-            findings = list(check(self.robot, tool_required=has_tool(self.robot)))
+            findings = list(check(self.robot, tool_required=self.robot.tool is not None))
             if ":" not in self.uri and (folder := session.files.path(self.uri)).is_dir():
                 findings += file_findings(folder) if (folder / CARD).is_file() else ()
             session.enqueue(lambda: self._show_findings(findings))
@@ -420,7 +419,7 @@ class Layers:
         """Tool positions (n, 3) [m] and their shell, once they are sampled."""
         self._gizmo: viser.TransformControlsHandle | None = None
         self._is_dragging = False
-        names = [name for name in TOGGLES if has_tool(page.robot) or name not in TOOL_TOGGLES]
+        names = [name for name in TOGGLES if page.robot.tool or name not in TOOL_TOGGLES]
         self._boxes = {name: gui.add_checkbox(name, name == "visual") for name in names}
         extent = scene_robot.robot_extent(page.robot)
         self._slice = gui.add_slider(
@@ -443,7 +442,7 @@ class Layers:
         """Draw what depends on the robot's configuration."""
         if self._is_on("ignored pairs"):
             scene_overlays.show_ignored_pairs(self._view)
-        if has_tool(self._robot):
+        if self._robot.tool:
             T_root_tool = kinematics.frame_pose(self._robot, self._page.q)
             if self._gizmo is not None and not self._is_dragging:
                 pose = Pose.from_matrix(T_root_tool)
