@@ -36,6 +36,7 @@ from morphgen.model import kinematics
 from morphgen.model.dynamics import actuation, gravity_load, mass_matrix
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Frame, Joint, Mimic, Robot
+from morphgen.model.rotation import unit_quaternion
 from morphgen.typing import Array
 
 POSITION_TOLERANCE = 1e-5  # largest accepted distance between a loader's tool and morphgen's [m]
@@ -524,8 +525,7 @@ def _add_solids(root: etree._Element, urdf: Path) -> None:
     for link in root.iterfind("link"):
         if link.find("inertial") is None and link.find("collision") is not None:
             body = model.body(link.get("name", ""))
-            w, x, y, z = body.iquat.tolist()
-            R = Pose(quaternion=(w, x, y, z)).matrix[:3, :3]
+            R = Pose(quaternion=unit_quaternion(body.iquat.tolist())).matrix[:3, :3]
             inertia = R @ np.diag(body.inertia) @ R.T
             _set_inertial(link, float(body.mass[0]), inertia, body.ipos.tolist())
 

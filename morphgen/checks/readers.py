@@ -21,6 +21,7 @@ from morphgen.model.dynamics import GRAVITY
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import joint_motions
 from morphgen.model.robot import Joint, JointKind, Mimic
+from morphgen.model.rotation import unit_quaternion, vec3
 from morphgen.typing import Array
 
 if TYPE_CHECKING:
@@ -467,15 +468,13 @@ def _motion(prim: Any, q: Mapping[str, Array], n: int) -> Array:  # noqa: ANN401
     if axis is None or positions is None:  # a fixed joint has no axis
         return np.tile(np.eye(4), (n, 1, 1))
     kind: JointKind = "prismatic" if prim.GetTypeName() == "PhysicsPrismaticJoint" else "revolute"
-    x, y, z = np.eye(3)["XYZ".index(axis)].tolist()
-    return joint_motions([Joint("", kind, "", "", axis=(x, y, z))], positions[:, None])[:, 0]
+    joint = Joint("", kind, "", "", axis=vec3(np.eye(3)["XYZ".index(axis)].tolist()))
+    return joint_motions([joint], positions[:, None])[:, 0]
 
 
 def _local(position: Any, rotation: Any) -> Array:  # noqa: ANN401
-    quaternion = np.array([rotation.GetReal(), *rotation.GetImaginary()], np.float64)
-    w, x, y, z = (quaternion / np.linalg.norm(quaternion)).tolist()
-    px, py, pz = map(float, position)
-    return Pose((px, py, pz), (w, x, y, z)).matrix
+    quaternion = unit_quaternion((rotation.GetReal(), *rotation.GetImaginary()))
+    return Pose(vec3(position), quaternion).matrix
 
 
 LOADERS = (

@@ -13,7 +13,7 @@ import numpy as np
 import scipy  # loads its packages at their first use, which take seconds
 
 from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape, Sphere
-from morphgen.model.rotation import IDENTITY, Quat, normalize
+from morphgen.model.rotation import IDENTITY, Quat, normalize, unit_quaternion, vec3
 from morphgen.typing import Array
 
 Kind = Literal["box", "cylinder", "sphere"]  # a kind of primitive that the fitter chooses from
@@ -43,8 +43,7 @@ def canonical(shape: Shape) -> Shape:
         case Box(edges):
             quaternion = least_rotation("box", R)
             R_canonical_old = Pose(quaternion=quaternion).matrix[:3, :3].T @ R
-            x, y, z = (np.abs(R_canonical_old.round()) @ edges).tolist()
-            geometry = Box((x, y, z))
+            geometry = Box(vec3((np.abs(R_canonical_old.round()) @ edges).tolist()))
         case _:
             return shape
     return replace(shape, geometry=geometry, T_link_shape=Pose(pose.position, quaternion))
@@ -63,8 +62,7 @@ def least_rotation(kind: Kind, R: Array) -> Quat:
         # The trace of a rotation is 1 + 2 cos(angle).
         traces = np.trace(rotations, axis1=1, axis2=2).round(_DECIMALS)
         best = scipy.spatial.transform.Rotation.from_matrix(rotations[np.argmax(traces)])
-        w, x, y, z = best.as_quat(scalar_first=True).tolist()
-        return normalize((w, x, y, z))
+        return unit_quaternion(best.as_quat(scalar_first=True).tolist())
     x, y, z = R[:, 2].tolist()
     if tuple(R[::-1, 2].round(_DECIMALS)) < (0.0, 0.0, 0.0):
         x, y, z = -x, -y, -z
@@ -73,5 +71,4 @@ def least_rotation(kind: Kind, R: Array) -> Quat:
 
 def rounded(quaternion: Quat) -> Quat:
     """Round a quaternion to nine decimals, beyond which fits differ between machines."""
-    w, x, y, z = (round(value, _DECIMALS) for value in normalize(quaternion))
-    return normalize((w, x, y, z))
+    return unit_quaternion(round(value, _DECIMALS) for value in normalize(quaternion))

@@ -28,7 +28,7 @@ from morphgen.errors import FitError
 from morphgen.fitting.canonical import KINDS, canonical
 from morphgen.fitting.solid import Solid
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
-from morphgen.model.rotation import IDENTITY, normalize
+from morphgen.model.rotation import IDENTITY, unit_quaternion, vec3
 from morphgen.typing import Array
 
 TRIM = 0.03  # share of a cloud's points outside of a guess at either end of an axis
@@ -367,9 +367,8 @@ class SampledSolid(Cloud):
         ):
             x, y, z = np.maximum(halves, 10.0**-DIGITS).tolist()
             geometries = (Box((2 * x, 2 * y, 2 * z)), Cylinder(x, 2 * z), Sphere(x))
-            a, b, c = np.round(centre, DIGITS).tolist()
-            w, i, j, k = np.round(quaternion, DIGITS + 3).tolist()
-            pose = Pose((a, b, c), normalize((w, i, j, k)))
+            position = vec3(np.round(centre, DIGITS).tolist())
+            pose = Pose(position, unit_quaternion(np.round(quaternion, DIGITS + 3).tolist()))
             shapes.append(canonical(Shape(geometries[kind], pose)))  # in the order of KINDS
         return tuple(shapes)
 

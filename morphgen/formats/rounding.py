@@ -13,7 +13,7 @@ from dataclasses import replace
 
 from morphgen.model.geometry import Geometry, Mesh, Pose, Shape, map_dimensions
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Inertial, Joint, Mimic, Robot
-from morphgen.model.rotation import Vec3, normalize
+from morphgen.model.rotation import Vec3, unit_quaternion, vec3
 
 _ROTATION_DECIMALS = 10
 """Decimals of a quaternion divided by its largest entry; angles of 12 digits err up to 1.5e-11."""
@@ -57,8 +57,8 @@ def rounded_pose(pose: Pose) -> Pose:
         return pose
     # The first of nearly equal entries, so that rounding errors do not change the choice.
     lead = next(value for value in entries if abs(value) > largest - _TIE_TOLERANCE)
-    w, x, y, z = (round(value / lead, _ROTATION_DECIMALS) for value in entries)
-    return Pose(_vector(pose.position), normalize((w, x, y, z)))
+    rounded = (round(value / lead, _ROTATION_DECIMALS) for value in entries)
+    return Pose(_vector(pose.position), unit_quaternion(rounded))
 
 
 def rounded_axis(joint: Joint) -> Vec3:
@@ -130,5 +130,4 @@ def _joint(joint: Joint) -> Joint:
 
 
 def _vector(vector: Vec3) -> Vec3:
-    x, y, z = map(round_number, vector)
-    return (x, y, z)
+    return vec3(map(round_number, vector))

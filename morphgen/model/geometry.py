@@ -34,16 +34,13 @@ class Pose:
     @classmethod
     def from_xyz_rpy(cls, xyz: Vec3 = (0, 0, 0), rpy: Vec3 = (0, 0, 0)) -> Pose:
         """Build from the position [m] and roll-pitch-yaw [rad] of a URDF ``<origin>``."""
-        return cls((float(xyz[0]), float(xyz[1]), float(xyz[2])), rotation.from_rpy(rpy))
+        return cls(rotation.vec3(xyz), rotation.from_rpy(rpy))
 
     @classmethod
     def from_matrix(cls, matrix: Array) -> Pose:
         """Build from a (4, 4) homogeneous matrix."""
         rows = matrix[:3, :3].tolist()
-        x, y, z = matrix[:3, 3].tolist()
-        return cls(
-            (x, y, z), rotation.from_matrix((tuple(rows[0]), tuple(rows[1]), tuple(rows[2])))
-        )
+        return cls(rotation.vec3(matrix[:3, 3].tolist()), rotation.from_matrix(rows))
 
     @cached_property
     def matrix(self) -> Array:
@@ -206,10 +203,9 @@ def half_extents(primitive: Primitive) -> Vec3:
 
 def map_dimensions(function: Callable[[float], float], primitive: Primitive) -> Primitive:
     """Return the primitive whose ``dimensions`` are those of another one after a function."""
-    sizes = tuple(map(function, dimensions(primitive)))
+    sizes = map(function, dimensions(primitive))
     if isinstance(primitive, Box):
-        x, y, z = sizes
-        return Box((x, y, z))
+        return Box(rotation.vec3(sizes))
     return type(primitive)(*sizes)
 
 

@@ -29,6 +29,7 @@ from morphgen.model.geometry import (
 )
 from morphgen.model.mesh import Triangles, convex_hull, load_mesh, mesh_key, mesh_triangles
 from morphgen.model.robot import Inertial, Link
+from morphgen.model.rotation import vec3
 from morphgen.typing import Array
 
 if TYPE_CHECKING:
@@ -53,8 +54,7 @@ def inertial_from_density(shapes: Sequence[Shape], density: float) -> Inertial:
     com = moments[:3, 3] / volume
     central = moments[:3, :3] - volume * np.outer(com, com)
     inertia = density * (np.trace(central) * np.eye(3) - central)
-    x, y, z = com.tolist()
-    return Inertial.from_matrix(density * volume, (x, y, z), inertia)
+    return Inertial.from_matrix(density * volume, vec3(com.tolist()), inertia)
 
 
 def with_inertia(link: Link, density: float) -> Link:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 Vec3 = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
@@ -10,6 +11,18 @@ Quat = tuple[float, float, float, float]
 IDENTITY: Quat = (1.0, 0.0, 0.0, 0.0)
 _GIMBAL, _NEAR_GIMBAL = 1e-12, 1e-3
 """Cosines of the pitch below which yaw is set to zero, and roll is computed from the yaw."""
+
+
+def vec3(values: Iterable[float]) -> Vec3:
+    """Return three numbers, such as those of an array, as a vector."""
+    x, y, z = values
+    return (float(x), float(y), float(z))
+
+
+def unit_quaternion(values: Iterable[float]) -> Quat:
+    """Return four numbers (w, x, y, z), such as those of an array, as a rotation."""
+    w, x, y, z = values
+    return normalize((float(w), float(x), float(y), float(z)))
 
 
 def normalize(q: Quat) -> Quat:

@@ -338,13 +338,7 @@ def _below(model: mujoco.MjModel, body: int) -> tuple[int, ...]:
 
 def _pose(position: Array, quaternion: Array) -> Pose:
     """Return a pose from MuJoCo's position (3,) [m] and quaternion (4,), (w, x, y, z)."""
-    a, b, c, d = (float(value) for value in quaternion)
-    return Pose(_vector(position), rotation.normalize((a, b, c, d)))
-
-
-def _vector(values: Array) -> Vec3:
-    x, y, z = (float(value) for value in values)
-    return (x, y, z)
+    return Pose(rotation.vec3(position), rotation.unit_quaternion(quaternion))
 
 
 class _Reader:
@@ -446,9 +440,9 @@ class _Reader:
         """Return a joint, and the pose of its body's frame in the frame of its child link."""
         model, name = self._model, self._names[joint]
         is_slide = model.jnt_type[joint] == _JOINT.mjJNT_SLIDE
-        axis = _vector(model.jnt_axis[joint])
+        axis = rotation.vec3(model.jnt_axis[joint])
         # The link of a hinge is at its anchor; a slide moves every point alike.
-        anchor = (0.0, 0.0, 0.0) if is_slide else _vector(model.jnt_pos[joint])
+        anchor = (0.0, 0.0, 0.0) if is_slide else rotation.vec3(model.jnt_pos[joint])
         position = self._couplings.locks.get(joint, 0.0)
         # The body is written at the joint's ref, and a URDF's at position zero.
         motion = position - _ref(model, joint)

@@ -37,7 +37,6 @@ from morphgen.model.geometry import (
 )
 from morphgen.model.mesh import require_bounded_files
 from morphgen.model.robot import Frame, Inertial, Joint, JointKind, Link, Mimic, Robot
-from morphgen.model.rotation import Vec3
 
 MAX_URDF_BYTES = 8 * 2**20  # largest URDF that is read [bytes]
 _MESH = "geometry[1]/mesh"
@@ -327,7 +326,7 @@ def _joint(element: etree._Element) -> Joint:
         "" if parent is None else parent.get("link", ""),
         "" if child is None else child.get("link", ""),
         _origin(element),
-        (1.0, 0.0, 0.0) if axis is None else _vector(axis.get("xyz", "1 0 0")),
+        (1.0, 0.0, 0.0) if axis is None else rotation.vec3(_numbers(axis.get("xyz", "1 0 0"))),
         None if lower is None and upper is None else (lower or 0.0, upper or 0.0),
         _number(limit, "effort"),
         _number(limit, "velocity"),
@@ -391,7 +390,7 @@ def _geometry(holder: etree._Element, meshes: Mapping[str, Path]) -> Geometry | 
     geometry: Primitive
     match element.tag:
         case "box":
-            geometry = Box(_vector(element.get("size", "")))
+            geometry = Box(rotation.vec3(_numbers(element.get("size", ""))))
         case "sphere":
             geometry = Sphere(float(element.get("radius", "")))
         case "capsule":
@@ -410,11 +409,11 @@ def _origin(holder: etree._Element) -> Pose:
     origin = holder.find("origin")
     if origin is None:
         return IDENTITY
-    xyz = _vector(origin.get("xyz", "0 0 0"))
+    xyz = rotation.vec3(_numbers(origin.get("xyz", "0 0 0")))
     if (text := origin.get("quat_xyzw")) is not None:
-        x, y, z, w = _numbers(text)
-        return Pose(xyz, rotation.normalize((w, x, y, z)))
-    return Pose.from_xyz_rpy(xyz, _vector(origin.get("rpy", "0 0 0")))
+        *vector, scalar = _numbers(text)
+        return Pose(xyz, rotation.unit_quaternion((scalar, *vector)))
+    return Pose.from_xyz_rpy(xyz, rotation.vec3(_numbers(origin.get("rpy", "0 0 0"))))
 
 
 def _shape(holder: etree._Element, meshes: Mapping[str, Path], rgba: Rgba | None) -> Shape | None:
@@ -447,8 +446,3 @@ def _number(element: etree._Element | None, name: str) -> float | None:
 
 def _numbers(text: str) -> list[float]:
     return [float(word) for word in text.replace(",", " ").split()]
-
-
-def _vector(text: str) -> Vec3:
-    x, y, z = _numbers(text)
-    return (x, y, z)

@@ -175,8 +175,8 @@ def _number_findings(element: etree._Element, attribute: Attribute) -> Iterator[
     numbers = [float(word) for word in words]
     is_short = attribute.positive and 0 < min(numbers) < MIN_LENGTH
     if max(map(abs, numbers)) > MAX_NUMBER or is_short:
-        values = {"shown": shown, "most": MAX_NUMBER, "least": MIN_LENGTH}
-        yield _finding(element, "number-absurd", **values)
+        bounds = {"most": MAX_NUMBER, "least": MIN_LENGTH}
+        yield _finding(element, "number-absurd", shown=shown, **bounds)
     if attribute.positive and min(numbers) <= 0:
         yield _finding(element, "size-not-positive", shown=shown, repairable=min(numbers) == 0)
     if name == "scale" and 0.0 in numbers:
