@@ -18,12 +18,7 @@ from morphgen.formats.bundle import MJCF, URDF, mesh_file
 from morphgen.formats.description import is_mjcf
 from morphgen.formats.mjcf.document import read_document, remove_element
 from morphgen.formats.resolve import PackageFinder, default_finder, resolve_uri
-from morphgen.formats.urdf.read import (
-    require_description_file,
-    resolved_meshes,
-    robot_from_xml,
-    urdf_bytes,
-)
+from morphgen.formats.urdf import read
 from morphgen.formats.urdf.schema import CHILDREN
 from morphgen.formats.xml import parse_description
 from morphgen.model.geometry import Mesh
@@ -51,7 +46,7 @@ def loader_copy(path: Path, finder: PackageFinder | None = None) -> Iterator[Pat
     with TemporaryDirectory(prefix="morphgen-") as name:
         folder = Path(name)
         if not path.is_dir():
-            require_description_file(path)
+            read.require_description_file(path)
             if is_mjcf(path):
                 _copy_mjcf(path, folder, finder)
             else:
@@ -77,10 +72,10 @@ def _copy_mjcf(path: Path, folder: Path, finder: PackageFinder) -> None:
 
 
 def _copy_urdf(path: Path, folder: Path, finder: PackageFinder) -> None:
-    data = urdf_bytes(path, {}, finder)
-    require_bounded_meshes(robot_from_xml(data, path, finder))
+    data = read.urdf_bytes(path, {}, finder)
+    require_bounded_meshes(read.robot_from_xml(data, path, finder))
     root, _ = parse_description(data, str(path))
-    meshes, _, _ = resolved_meshes(root, path, finder)
+    meshes, _, _ = read.resolved_meshes(root, path, finder)
     _keep_known(root)
     copied = _mesh_copies(folder)
     for shape in root.iterfind("link/*"):
