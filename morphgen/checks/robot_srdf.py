@@ -16,6 +16,7 @@ from morphgen.formats.srdf import LinkSpheres, require_tool
 from morphgen.model.geometry import Mesh
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import TOOL, Frame, Pair, Robot, sorted_pair
+from morphgen.model.tree import below
 
 Reason = Literal["Adjacent", "Default", "Always", "Never", "User"]
 REASONS: tuple[Reason, ...] = ("Adjacent", "Default", "Always", "Never", "User")
@@ -196,22 +197,13 @@ def _gripper_links(robot: Robot, tool: Frame) -> list[str]:
     moving = [k for k in chain if robot.joints[k].is_movable]
     if not moving:
         return []
-    hand = _below(robot, moving[-1] + 1)
+    hand = below(robot.parents, moving[-1] + 1)
     gripper = [k for k in robot.movable_joints if k + 1 in hand and k not in chain]
     if not gripper:
         return []
     chains = [(0, *(i + 1 for i in robot.joint_chain(robot.joints[k].parent))) for k in gripper]
     shared = [links[0] for links in zip(*chains, strict=False) if len(set(links)) == 1]
-    links = _below(robot, shared[-1])
+    links = below(robot.parents, shared[-1])
     if links[0] == moving[-1] + 1:
         links = links[1:]
     return [robot.links[i].name for i in links]
-
-
-def _below(robot: Robot, root: int) -> list[int]:
-    """Return the indices of a link and of all links below it, in their order."""
-    below = [root]
-    for i in range(root + 1, len(robot.links)):
-        if robot.parents[i] in below:
-            below.append(i)
-    return below

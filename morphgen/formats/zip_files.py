@@ -6,6 +6,7 @@ name, or unpack to more than the disk holds. Everything is checked before the fi
 
 from __future__ import annotations
 
+import posixpath
 import stat
 import struct
 import tokenize
@@ -129,12 +130,8 @@ def safe_entries(archive: zipfile.ZipFile, limits: ZipLimits) -> list[tuple[zipf
 
 def stays_inside(path: str) -> bool:
     """Return whether a path with slashes or backslashes stays in the folder that it starts in."""
-    depth = 0
-    for part in path.replace("\\", "/").split("/"):
-        depth += {"..": -1, ".": 0, "": 0}.get(part, 1)
-        if depth < 0:
-            return False
-    return not path.startswith(("/", "\\"))
+    normal = posixpath.normpath(path.replace("\\", "/"))
+    return normal != ".." and not normal.startswith(("/", "../"))
 
 
 def _unpack_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from morphgen.errors import RobotError, nearest
@@ -41,6 +41,15 @@ def subtree(robot: Robot, root: str, without: Collection[str] = ()) -> Robot:
         frames=tuple(frame for frame in robot.frames if frame.link in kept),
         ignore_pairs=tuple((a, b) for a, b in robot.ignore_pairs if a in kept and b in kept),
     )
+
+
+def below(parents: Sequence[int], root: int) -> list[int]:
+    """Return the indices of a node of a tree and of all below it; parents come before children."""
+    nodes = [root]
+    for i in range(root + 1, len(parents)):
+        if parents[i] in nodes:
+            nodes.append(i)
+    return nodes
 
 
 def take_name(name: str, taken: set[str]) -> str:

@@ -57,7 +57,7 @@ from morphgen.model.robot import (
 )
 from morphgen.model.rotation import Vec3
 from morphgen.model.scene_files import MAX_COORDINATE, MAX_FACES
-from morphgen.model.tree import take_name
+from morphgen.model.tree import below, take_name
 from morphgen.typing import Array
 
 _REFUSALS = (ValueError, mujoco.FatalError)  # exceptions by which MuJoCo refuses a document
@@ -281,7 +281,8 @@ def _robot_root(
     if not top:
         raise document.error("it has no bodies; expected at least one in <worldbody>")
     if len(top) > 1:
-        still = [b for b in top if not any(model.body_jntnum[other] for other in _below(model, b))]
+        parents = model.body_parentid.tolist()
+        still = [body for body in top if not model.body_jntnum[below(parents, body)].any()]
         apart = still or [body for body in top if _is_free(model, body)]
         if apart:
             word = "is free" if _is_free(model, apart[0]) else "has no joints"
@@ -327,15 +328,6 @@ def _is_free(model: mujoco.MjModel, body: int) -> bool:
     return bool(joint >= 0 and model.jnt_type[joint] == _JOINT.mjJNT_FREE)
 
 
-def _below(model: mujoco.MjModel, body: int) -> tuple[int, ...]:
-    """Return a body and those below it, parents before children."""
-    kept = {body: None}
-    for other in range(body + 1, model.nbody):
-        if int(model.body_parentid[other]) in kept:
-            kept[other] = None
-    return tuple(kept)
-
-
 def _pose(position: Array, quaternion: Array) -> Pose:
     """Return a pose from MuJoCo's position (3,) [m] and quaternion (4,), (w, x, y, z)."""
     return Pose(rotation.vec3(position), rotation.unit_quaternion(quaternion))
@@ -364,7 +356,7 @@ class _Reader:
         self._findings = findings
         self._ellipsoids: list[str] = []
         self._paired = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist()}
-        self.bodies = _below(model, root)
+        self.bodies = below(model.body_parentid.tolist(), root)
         inside = {*self.bodies} - {root}
         self.joints = [j for j in range(model.njnt) if int(model.jnt_bodyid[j]) in inside]
         for kind, why in _REFUSED_JOINTS.items():
