@@ -25,7 +25,7 @@ from morphgen.errors import FitError
 from morphgen.fitting import search
 from morphgen.fitting.canonical import KINDS, Kind, least_rotation, rounded
 from morphgen.fitting.quality import Quality, quality, signed_distance
-from morphgen.fitting.solid import Solid, solid_of
+from morphgen.fitting.solid import Solid, solid_of, spiral
 from morphgen.formats.fits import MAX_PRIMITIVES, are_primitives, shape_to_data
 from morphgen.model import rotation
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere, volume
@@ -173,11 +173,8 @@ def _outermost(points: Array) -> Array:
 
 
 def _half_sphere(n: int) -> Array:
-    """Return directions spread evenly over half the sphere (Fibonacci lattice), shape (n, 3)."""
-    z = (np.arange(n) + 0.5) / n
-    angle = math.pi * (1 + math.sqrt(5)) * np.arange(n)  # multiples of the golden angle
-    radius = np.sqrt(1 - z * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+    """Return directions spread evenly over half the sphere, shape (n, 3)."""
+    return spiral((np.arange(n) + 0.5) / n)
 
 
 def _frames(z: Array) -> Array:

@@ -322,19 +322,18 @@ def _openness(rays: RayMeshIntersector, points: Array) -> Array:
     """
     if not len(points):
         return np.zeros(0)
+    directions = spiral(1 - 2 * (np.arange(NUM_RAYS) + 0.5) / NUM_RAYS, 0.5)
     hits = rays.intersects_any(
-        np.repeat(points, NUM_RAYS, axis=0), np.tile(_directions(), (len(points), 1))
+        np.repeat(points, NUM_RAYS, axis=0), np.tile(directions, (len(points), 1))
     )
     return np.asarray(1 - hits.reshape(len(points), NUM_RAYS).mean(axis=1))
 
 
-def _directions() -> Array:
-    """Return evenly spread directions, shape (NUM_RAYS, 3): the Fibonacci lattice on the sphere.
+def spiral(z: Array, start: float = 0.0) -> Array:
+    """Return the directions (n, 3) of a Fibonacci lattice on the sphere, by their heights (n,).
 
     Equal steps along z cut zones of equal area; the golden angle spreads them around z.
     """
-    step = np.arange(NUM_RAYS) + 0.5
-    z = 1 - 2 * step / NUM_RAYS
-    turn = np.pi * (1 + np.sqrt(5)) * step  # multiples of the golden angle
+    turn = np.pi * (1 + np.sqrt(5)) * (np.arange(len(z)) + start)  # multiples of the golden angle
     radius = np.sqrt(1 - z * z)
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
