@@ -173,15 +173,14 @@ def hold_row(
         return HoldRow(name, None, message="not installed")
     if not robot.movable_joints:
         return HoldRow(name, True, 0.0, "", "", 0.0, 0.0, 0.0)
-    find_causes = partial(_causes, robot, contact_margin)
     try:
         with simulated() as simulation:
             row = _hold(name, robot, simulation)
             if row.passed:
-                return _stepped(row, robot, simulation, find_causes)
+                return _stepped(row, robot, simulation, contact_margin)
     except MorphgenError as error:
         return HoldRow(name, False, message=str(error))
-    return replace(row, causes=find_causes(np.array(robot.home)))
+    return replace(row, causes=_causes(robot, contact_margin, np.array(robot.home)))
 
 
 def _hold(name: str, robot: Robot, simulation: SimulatedRobot) -> HoldRow:
@@ -200,10 +199,7 @@ def _hold(name: str, robot: Robot, simulation: SimulatedRobot) -> HoldRow:
 
 
 def _stepped(
-    row: HoldRow,
-    robot: Robot,
-    simulation: SimulatedRobot,
-    find_causes: Callable[[Array], tuple[str, ...]],
+    row: HoldRow, robot: Robot, simulation: SimulatedRobot, contact_margin: float | None
 ) -> HoldRow:
     """Add the steps of all independent joints to the row of a robot that holds its home."""
     steps: list[_Step] = []
@@ -224,7 +220,8 @@ def _stepped(
         return row
     others = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
     # Links that penetrate at home may hold a joint that steps out of the contact.
-    causes = [find_causes(step.target) or find_causes(np.array(robot.home)) for step in failed]
+    find_causes, home = partial(_causes, robot, contact_margin), np.array(robot.home)
+    causes = [find_causes(step.target) or find_causes(home) for step in failed]
     # They are the causes only if every step that fails has one.
     known = tuple(dict.fromkeys(chain.from_iterable(causes))) if all(causes) else ()
     return replace(row, passed=False, message=f"{failed[0].fault}{others}", causes=known)

@@ -348,7 +348,7 @@ def fit_shapes(
     if is_kept:
         kept = tuple(replace(shape, rgba=None) for shape in shapes)
         single = kept[0] if len(kept) == 1 else None
-        return _measure(kept, single, solid, start, method="primitives")
+        return replace(_measure(kept, single, solid, start), solid="primitives")
     return fit_solid(solid, options)
 
 
@@ -376,12 +376,8 @@ def fit_solid(solid: Solid, options: FitOptions) -> LinkFit:
 
 
 def _measure(
-    primitives: tuple[Shape, ...],
-    single: Shape | None,
-    solid: Solid,
-    start: float,
-    method: str | None = None,
+    primitives: tuple[Shape, ...], single: Shape | None, solid: Solid, start: float
 ) -> LinkFit:
     seconds = time.perf_counter() - start  # of the fit, without the measurement
-    measured, method = quality(solid, primitives), method or solid.method
-    return LinkFit(primitives, single, method, measured, seconds, solid.decimated_from)
+    measured = quality(solid, primitives)
+    return LinkFit(primitives, single, solid.method, measured, seconds, solid.decimated_from)

@@ -163,11 +163,7 @@ def _cached_fits(links: Iterable[Link], kind: str) -> dict[str, StoredFit]:
 
 
 def _fit_and_keep(
-    robot: Robot,
-    links: Sequence[Link],
-    options: FitOptions,
-    kind: str,
-    stored: StoredFits,
+    robot: Robot, links: Sequence[Link], options: FitOptions, kind: str, stored: StoredFits
 ) -> dict[str, StoredFit]:
     """Fit links with collision shapes, say so, keep the fits in the cache, and return them."""
     from morphgen.fitting.robot_fit import fit_links, fits_of  # needs the extra fit
