@@ -305,9 +305,9 @@ def _link(
     """Convert a ``<link>``; meshes are the files by URI, colours the robot's named materials."""
     visuals, collisions = (
         joined_capsules(
-            (holder.get("name", ""), shape)
+            (holder.get("name", ""), Shape(geometry, _origin(holder), _rgba(holder, colours)))
             for holder in element.iterfind(kind)
-            if (shape := _shape(holder, meshes, _rgba(holder, colours))) is not None
+            if (geometry := _geometry(holder, meshes)) is not None
         )
         for kind in ("visual", "collision")
     )
@@ -343,9 +343,8 @@ def _named_colours(
     colours = {m.get("name", ""): _colour(m) for m in root.iterfind("material")}
     used = root.findall("link/visual/material")
     for material in used:
-        colours[material.get("name", "")] = colours.get(material.get("name", "")) or _colour(
-            material
-        )
+        name = material.get("name", "")
+        colours[name] = colours.get(name) or _colour(material)
     unknown = [m for m in used if m.get("name") and colours[m.get("name", "")] is None]
     unknown = [m for m in unknown if m.find("texture") is None]
     if not unknown:
@@ -414,14 +413,6 @@ def _origin(holder: etree._Element) -> Pose:
         *vector, scalar = _numbers(text)
         return Pose(xyz, rotation.unit_quaternion((scalar, *vector)))
     return Pose.from_xyz_rpy(xyz, rotation.vec3(_numbers(origin.get("rpy", "0 0 0"))))
-
-
-def _shape(holder: etree._Element, meshes: Mapping[str, Path], rgba: Rgba | None) -> Shape | None:
-    """Convert a ``<visual>`` or ``<collision>``; None if it has no shape or one of size zero."""
-    geometry = _geometry(holder, meshes)
-    if geometry is None:
-        return None
-    return Shape(geometry, _origin(holder), rgba)
 
 
 def _rgba(holder: etree._Element, colours: Mapping[str, Rgba | None]) -> Rgba | None:
