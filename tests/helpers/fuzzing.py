@@ -7,6 +7,7 @@ Commands share a process because starting one takes longer than most commands ru
 import contextlib
 import io
 import json
+import math
 import os
 import resource
 import select
@@ -70,8 +71,9 @@ class Runner:
 
 def serve() -> None:
     """Run the commands that arrive on stdin."""
-    from morphgen.cli import main
+    from morphgen.cli import main, progress
 
+    progress.FIRST_LINE = math.inf  # on a busy machine all work is long, and would print lines
     resource.setrlimit(resource.RLIMIT_AS, (_ADDRESS_SPACE, _ADDRESS_SPACE))
     answers = sys.stdout
     for line in sys.stdin:
