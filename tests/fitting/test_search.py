@@ -3,8 +3,6 @@
 import itertools
 import math
 import os
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +11,7 @@ import trimesh
 from scipy.integrate import dblquad
 from scipy.spatial.transform import Rotation
 
+from helpers.commands import run_python
 from helpers.robots import arm
 from morphgen.errors import FitError, FormatError
 from morphgen.fitting import search
@@ -137,13 +136,7 @@ assert "torch" not in sys.modules  # whose import takes longer than the fit
 def test_the_same_seed_gives_the_same_shapes_with_any_number_of_threads():
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
     found = [
-        subprocess.run(
-            [sys.executable, "-c", FIT],
-            env={**os.environ, **dict.fromkeys(names, threads)},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
+        run_python(FIT, env={**os.environ, **dict.fromkeys(names, threads)}).stdout
         for threads in ("1", "3")
     ]
     assert "Shape" in found[0]

@@ -7,7 +7,6 @@ import random
 import re
 import shutil
 import stat
-import subprocess
 import sys
 from dataclasses import replace
 from importlib.util import find_spec
@@ -19,7 +18,7 @@ import trimesh
 from PIL import Image
 
 import morphgen
-from helpers.commands import tree
+from helpers.commands import run_python, tree
 from helpers.robots import arm
 from morphgen.errors import FormatError, MissingDependencyError
 from morphgen.fitting import token_shapes as module
@@ -441,8 +440,7 @@ def test_triton_is_imported_before_an_opengl_library(monkeypatch):
 @pytest.mark.skipif(find_spec("triton") is None, reason="this PyTorch has no triton")
 def test_a_process_can_draw_and_then_import_triton():
     code = "from morphgen.formats.picture import gl_context; gl_context(8, 8).free(); import triton"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert run_python(code).stderr == ""
 
 
 def test_a_picture_does_not_depend_on_optional_packages(tmp_path, monkeypatch):

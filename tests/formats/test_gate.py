@@ -15,6 +15,7 @@ import trimesh
 from PIL import Image
 from trimesh.exchange.stl import export_stl
 
+from helpers.commands import run_python
 from helpers.fuzzing import MEMORY_MIB, Runner
 from helpers.robots import arm
 from helpers.uploads import archive
@@ -647,10 +648,8 @@ libc.fflush(None)
 
 @pytest.mark.skipif(os.name != "posix", reason="C's buffers are reached by POSIX's names")
 def test_buffered_c_output_is_not_printed_at_exit():
-    command = [sys.executable, "-c", PRINTING]
-    result = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert result.stdout == "after\n"
-    assert result.stderr == ""
+    result = run_python(PRINTING)
+    assert (result.stdout, result.stderr) == ("after\n", "")
 
 
 CODE = """
@@ -672,12 +671,6 @@ MINE = "import mujoco; mujoco.set_mju_user_warning(lambda text: print('mine', te
 
 @pytest.mark.parametrize(("before", "name"), [("", "morphgen.mujoco WARNING"), (MINE, "mine")])
 def test_a_warning_is_logged_or_goes_to_the_users_callback_and_to_no_file(before, name, tmp_path):
-    result = subprocess.run(
-        [sys.executable, "-c", before + CODE],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=tmp_path,
-    )
+    result = run_python(before + CODE, cwd=tmp_path)
     assert result.stdout.startswith(f"{name} Nan, Inf or huge value in QVEL")
     assert list(tmp_path.iterdir()) == []

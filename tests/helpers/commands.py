@@ -6,6 +6,12 @@ import subprocess
 import sys
 
 
+def run_python(code, **options):
+    """Run a program in a process of its own; return its result."""
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, check=True, **options)
+
+
 def tree(folder):
     """Content of every file below a folder, by path; None for a folder."""
     return {
