@@ -7,10 +7,11 @@ alone writes files. The metrics of an update, which are those of all processes, 
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TypeVar
 
@@ -20,33 +21,37 @@ from torch import distributed
 from morphgen.errors import TaskError
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class UpdateMetrics:
-    """Metrics of one update; means over its transitions unless said otherwise."""
+    """Metrics of one update; means over its transitions unless said otherwise.
+
+    Those with a default need environments: cloning has none.
+    """
 
     update: int  # number of updates so far, this one included
     transitions: int  # control steps of all environments so far
     reward: float  # mean reward of a control step
-    score: float  # mean task score of a control step
-    scores: tuple[float, ...]
+    score: float = math.nan  # mean task score of a control step
+    scores: tuple[float, ...] = ()
     """Mean score of each robot, or of the robots of each grammar if they are drawn; nan for one
     without an environment."""
-    success: float
+    success: float = math.nan
     """Share of successes among the episodes that ended in the rollout; nan if none did."""
-    episodes: int  # number of episodes that ended in the rollout
-    unstable: int  # number of episodes that ended because the simulation diverged
-    terms: dict[str, float]  # mean of each reward term
+    episodes: int = 0  # number of episodes that ended in the rollout
+    unstable: int = 0  # number of episodes that ended because the simulation diverged
+    terms: dict[str, float] = field(default_factory=dict)  # mean of each reward term
     policy_loss: float  # clipped policy loss
     value_loss: float  # half the squared error, or `matching_loss` if the critic predicts symlogs
     entropy: float  # entropy of a robot's actions, or mean of its joints' [nats]
-    kl: float  # divergence of the updated policy from the one that acted [nats] (Schulman 2020, k3)
-    clip_fraction: float  # share of the probability ratios outside of the clip range
+    kl: float = math.nan
+    """Divergence of the updated policy from the one that acted [nats] (Schulman 2020, k3)."""
+    clip_fraction: float = math.nan  # share of the probability ratios outside of the clip range
     actor_gradient: float  # norm of the actor's gradient before clipping
     critic_gradient: float  # norm of the critic's gradient before clipping
     explained_variance: float
     """Share of the returns' variance that the values before the update explain."""
     learning_rate: float  # learning rate of the actor
-    collect_seconds: float  # time to collect the rollout [s]
+    collect_seconds: float = 0.0  # time to collect the rollout [s]
     learn_seconds: float  # time to learn from it [s]
     steps_per_second: float  # transitions per second, collection and learning together
 

@@ -68,7 +68,6 @@ class EvalConfig:
     """Configs of tasks; other tasks have their defaults."""
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if self.episodes < 1 or not 0 <= self.seed < 2**63:
             raise TaskError(
                 f"{self.episodes} episodes, seed {self.seed}: expected at least one episode, and a "

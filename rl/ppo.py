@@ -537,13 +537,10 @@ class Learner:
         return (weights * error).mean(), error.mean()[None].detach()
 
     def _robot_weights(self) -> torch.Tensor:
-        """Return the weight of each robot's transitions, shape (R,), mean 1.
-
-        With reweighting they are drawn for each gradient step: a softmax of normal numbers (Lin et
-        al. 2022, "Reasonable effectiveness of random weighting").
-        """
+        """Return the weight of each robot's transitions, shape (R,), mean 1."""
         if not self.config.task_reweighting:
             return torch.ones(self.num_robots, device=self.device)
+        # Lin et al. 2022, "Reasonable effectiveness of random weighting".
         normal = torch.empty(self.num_robots, device=self.device)
         normal.normal_(generator=self.generators["weights"])
         return self.num_robots * torch.softmax(normal, dim=0)

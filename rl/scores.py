@@ -428,7 +428,6 @@ class Evaluation:
         return "\n".join(lines)
 
     def __str__(self) -> str:
-        """Return the table and the summary."""
         return f"{self.table()}\n{self.summary()}"
 
     def write(self, path: str | PathLike[str]) -> None:

@@ -104,7 +104,6 @@ class JointMotion(Generic[A]):
     """
 
     def __init__(self, tables: RobotTables, env_robot_index: torch.Tensor) -> None:
-        """Gather the tables of the robots (n,)."""
         link = tables.link_of_joint[env_robot_index]
         self._link: Any = flat_index(link, tables.max_links)
         self._max_step: Any = tables.max_step[env_robot_index]

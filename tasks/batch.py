@@ -287,10 +287,8 @@ class TaskBatch:
         timed_out = self.episode_step >= self.max_episode_steps
         truncated = (timed_out | diverged) & ~result.terminated  # an end wins over the time limit
         final_observation = self._observe(state)  # before new episodes change goals and layouts
-        q, object_pose = (
-            state.q.clone(),
-            state.object_pose.clone(),
-        )  # the simulation overwrites them
+        # The simulation overwrites them.
+        q, object_pose = state.q.clone(), state.object_pose.clone()
         ended = truncated | result.terminated
         if is_host(self.device) and not ended.any():
             observation = copied(final_observation)
@@ -382,12 +380,7 @@ class TaskBatch:
         return self.groups.evaluate(task_state)
 
     def _begin(self, mask: torch.Tensor, options: Mapping[str, Any] | None = None) -> EpisodeRandom:
-        """Begin episodes in some environments; return their random numbers.
-
-        Args:
-            mask: The environments, shape (n,), bool.
-            options: As of ``reset``, if all environments begin.
-        """
+        """Begin episodes in some environments, (n,), bool; return their random numbers."""
         random = self._episodes.begin(mask)
         self.layouts.draw(mask, random)
         layout = self.layouts.current if self.layouts.any else None

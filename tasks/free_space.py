@@ -88,7 +88,7 @@ def _is_outside(plane: JointPlane, q: Array) -> bool:
 
 
 def _joint_plane(robot: Robot, joints: tuple[int, ...], pairs: Sequence[Pair]) -> JointPlane | None:
-    """Return the plane of one or two joints; None if its free cells form one component."""
+    """Return the plane of joints; None if its free cells form one component."""
     columns = [*joints]
     lower, upper = joint_limits(robot).T[:, columns]
     count = np.clip(np.ceil((upper - lower) / CELL), FEWEST, MOST).astype(int)
@@ -160,7 +160,6 @@ class FreeSpace:
     """
 
     def __init__(self, scene: Scene) -> None:
-        """Compile the scene into a collision checker."""
         self.scene = scene
         link_names = {link.name for link in scene.robot.links}
         self._obstacles = [_unused(f"obstacle{k}", link_names) for k in range(len(scene.obstacles))]
@@ -367,10 +366,8 @@ def _with_surroundings(
 ) -> Robot:
     """Return the robot with ground, obstacles, block and tool point as further links.
 
-    The ground is fixed to the root: links that are fixed to each other are never tested. Obstacles
-    must be tested against the root too, so each is on a virtual slide that stays at zero; so is the
-    base of an articulated object. The block, or the link that moves, has virtual joints for every
-    direction.
+    Links that are fixed to each other are never tested, as the ground and the root. Obstacles and
+    bases of objects must be tested against the root: they are on virtual slides that stay at zero.
     """
     robot = scene.robot
     link_names = {link.name for link in robot.links}

@@ -17,6 +17,7 @@ import torch
 
 from morphgen.encoding.tokens import GEOMETRY, SHAPE_POSE
 from morphgen.errors import TaskError
+from morphgen.model.geometry import Mesh, half_extents
 from morphgen.model.kinematics_torch import (
     FrameChain,
     KinematicTree,
@@ -32,9 +33,10 @@ from morphgen.model.kinematics_torch import (
     rotvec_from_matrix,
     solve_ik,
 )
-from morphgen.tasks.clearance import capsule_box_distance, compile_capsules
+from morphgen.model.robot import Robot
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.scenes.robot_tables import RobotTables
+from morphgen.typing import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +150,96 @@ class IkSolutions:
         self.q[rows], self.error[rows] = q[best, column], distance[best, column]
 
 
+BISECTIONS = 8  # halvings of a capsule's axis, to 1/256 of its length
+
+
+@dataclass(frozen=True, eq=False)
+class Capsules:
+    """Capsules around the primitives of R robots, S per robot, padded with ones at the root."""
+
+    link: torch.Tensor  # index of each capsule's link, shape (R, S), int64
+    ends: torch.Tensor  # ends of its axis in the link frame, shape (R, S, 2, 3) [m]
+    radius: torch.Tensor  # shape (R, S) [m]
+
+
+def compile_capsules(robots: Sequence[Robot], device: torch.device | str) -> Capsules:
+    """Return collision primitives of robots as capsules, but those of links that no joint moves.
+
+    A capsule is about the longest axis of its primitive, with the mean of the other two half
+    extents as its radius. It differs from rims of cylinders, edges of boxes and flat shapes: over
+    random configurations of arm3, UR5, Panda, xArm7 and Jaco among obstacles, distances below 5 cm
+    are off by 3 mm in the mean and 8 mm at most, all others by at most 36 mm.
+    """
+    rows = [_capsules(robot) for robot in robots]
+    size = len(robots), max(1, *map(len, rows))
+    link, ends, radius = np.zeros(size, dtype=np.int64), np.zeros((*size, 2, 3)), np.zeros(size)
+    for r, row in enumerate(rows):
+        for s, capsule in enumerate(row):
+            link[r, s], ends[r, s], radius[r, s] = capsule
+    values = torch.from_numpy(ends).float(), torch.from_numpy(radius).float()
+    return Capsules(torch.from_numpy(link).to(device), *(value.to(device) for value in values))
+
+
+def _capsules(robot: Robot) -> list[tuple[int, Array, float]]:
+    """Return link, ends of the axis (2, 3) and radius of a robot's capsules, in the link frames."""
+    capsules = []
+    for i, link in enumerate(robot.links):
+        if not {*robot.joint_chain(link.name)} & {*robot.movable_joints}:
+            continue
+        for shape in link.collisions:
+            if isinstance(shape.geometry, Mesh):
+                raise TaskError(
+                    f"observation channels contact and clearance: link {link.name!r} of robot "
+                    f"{robot.name!r} has a mesh as its collision shape; expected primitives: see "
+                    "morphgen fit"
+                )
+            half = np.array(half_extents(shape.geometry))
+            axis = int(half.argmax())
+            radius = float((half.sum() - half[axis]) / 2)
+            T = shape.T_link_shape.matrix
+            offset = max(half[axis] - radius, 0.0) * T[:3, axis]
+            capsules.append((i, np.stack([T[:3, 3] - offset, T[:3, 3] + offset]), radius))
+    return capsules
+
+
+def box_distance(point: torch.Tensor, half: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return signed distances (...) [m] of points (..., 3) from boxes with half edges (..., 3).
+
+    Returns also their gradients, unit vectors of shape (..., 3); points and gradients are in the
+    frames of the boxes.
+    """
+    excess = point.abs() - half
+    outside = excess.clamp(min=0)
+    length = torch.linalg.vector_norm(outside, dim=-1)
+    largest = excess.amax(dim=-1)
+    # Inside, the nearest face is the one with the largest, least negative excess.
+    axes = torch.arange(3, device=point.device)
+    face = (axes == excess.argmax(dim=-1, keepdim=True)).to(point.dtype)
+    is_outside = (largest > 0)[..., None]
+    direction = torch.where(is_outside, outside / length.clamp(min=1e-9)[..., None], face)
+    return length + largest.clamp(max=0), torch.copysign(direction, point)
+
+
+def capsule_box_distance(
+    ends: torch.Tensor, radius: torch.Tensor, half: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return signed distances (...) [m] of capsules with ends (..., 2, 3) from boxes (..., 3).
+
+    Returns also the nearest points on the axes and the distances' gradients there, both (..., 3).
+    All are in the frames of the boxes, which have half edges (..., 3). The distance is convex along
+    an axis; bisection finds its minimum.
+    """
+    start, along = ends[..., 0, :], ends[..., 1, :] - ends[..., 0, :]
+    fraction = torch.full_like(along[..., :1], 0.5)
+    for k in range(2, BISECTIONS + 2):
+        _, gradient = box_distance(start + fraction * along, half)
+        slope = (gradient * along).sum(dim=-1, keepdim=True)
+        fraction = fraction - torch.sign(slope) * 0.5**k
+    point = start + fraction * along
+    distance, gradient = box_distance(point, half)
+    return distance - radius, point, gradient
+
+
 IK_SHARE = 4  # column of the channel `ik` with the joint's action along the straight path, -1 to 1
 MAX_LAG = 3.0
 """Bound of the observed lag [largest steps]; no joint in free motion is further behind."""
@@ -243,7 +335,7 @@ class KinematicChannels:
         GPU this channel alone copies tensors from it.
 
     ``clearance`` (3)
-        How near the links that the joint moves are to the obstacles (``clearance``): 1 in contact
+        How near the links that the joint moves are to the obstacles, as ``Capsules``: 1 in contact
         and 0 far away, for two distances that count as far, and more than 1 in penetration; and
         the change of the distance by the joint's largest step, faded out likewise. All are zero
         without obstacles.
@@ -447,8 +539,7 @@ class KinematicChannels:
     def _nearest_point(self, state: _State) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the robot's points (n, 3) nearest to the block, and their Jacobians (n, 3, J).
 
-        Links are bounded by the boxes around their collision shapes' primitives. Mimic joints do
-        not count as parts of their leaders.
+        Links count as the boxes around their primitives, mimic joints not as parts of leaders.
         """
         T_root_link = state.T_root_link
         rows = torch.arange(len(state.q), device=state.q.device)

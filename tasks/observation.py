@@ -84,7 +84,6 @@ class ObservationConfig:
     """Minimum number of joints of ``tree_entries``, for batches after which others have more."""
 
     def __post_init__(self) -> None:
-        """Require counts."""
         if self.points < 0 or self.obstacles < 0:
             raise TaskError(
                 f"observation of {self.points} points and {self.obstacles} obstacles; "
@@ -120,7 +119,6 @@ class LinkTokens(Generic[A]):
     """Tokens of the links of a batch's environments; only codes of joint positions change."""
 
     def __init__(self, tables: RobotTables, env_robot_index: torch.Tensor) -> None:
-        """Gather the tables of every environment."""
         movable = tables.movable_links[env_robot_index]
         max_movable = int(movable.sum(dim=1).max())
         # Indices of movable links (n, M); robots with fewer are filled up with other links.
@@ -172,7 +170,6 @@ class LinkJoints(Generic[A]):
     """The independent joints that move the links of a batch's environments."""
 
     def __init__(self, tables: RobotTables, env_robot_index: torch.Tensor) -> None:
-        """Gather the tables of every environment."""
         joint = tables.joint_of_link[env_robot_index]
         self._joint: Any = flat_index(joint.clamp(min=0), tables.max_joints)
         self._has_joint: Any = joint >= 0
@@ -375,7 +372,6 @@ class PointClouds:
     """
 
     def __init__(self, scenes: Sequence[Scene], num_points: int, device: torch.device) -> None:
-        """Prepare; ``begin`` draws the points."""
         n, num_obstacles = len(scenes), max(len(scene.obstacles) for scene in scenes)
         self._local = torch.zeros(n, num_points, 3, device=device)
         self._on_block = torch.zeros(n, num_points, dtype=torch.bool, device=device)
@@ -460,7 +456,6 @@ class BatchObservation:
         action_mask: torch.Tensor,
         config: ObservationConfig,
     ) -> None:
-        """Gather the tables of all environments."""
         self._config, self._groups, self._layouts = config, groups, layouts
         index, device = env_robot_index, env_robot_index.device
         self.tokens: LinkTokens[torch.Tensor] = LinkTokens(robot_tables, index)

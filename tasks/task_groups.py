@@ -115,7 +115,6 @@ class TaskGroups:
     def __init__(
         self, specs: Sequence[EnvSpec], env_robot_index: torch.Tensor, num_joints: int
     ) -> None:
-        """Group environments by the tasks of their specifications."""
         device, self._num_joints = env_robot_index.device, num_joints
         index = env_robot_index.tolist()
         self._groups: dict[str, _Group] = {}

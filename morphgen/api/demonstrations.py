@@ -24,9 +24,13 @@ from morphgen.grammar.library import LibraryFolders, library_folders
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import AgentSpec, parse_agent
 from morphgen.rl.demonstrations.cloning import data_sets, recorded_source
-from morphgen.rl.demonstrations.dagger import read_planner, record_states
 from morphgen.rl.demonstrations.reader import Demonstrations
-from morphgen.rl.demonstrations.recording import PLANNER, RecordingConfig
+from morphgen.rl.demonstrations.recording import (
+    PLANNER,
+    RecordingConfig,
+    read_planner,
+    record_states,
+)
 from morphgen.rl.demonstrations.recording import record as record_episodes
 from morphgen.rl.demonstrations.replay import choose_episodes, replay
 from morphgen.rl.inference import read_controller

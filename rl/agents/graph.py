@@ -44,7 +44,6 @@ class Config(NetworkConfig):
     graph_hidden: int = 64  # hidden width of a layer's feedforward part and of the head
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         super().__post_init__()
         if self.graph_features % self.graph_heads:
             raise TaskError(

@@ -34,7 +34,6 @@ class Config(NetworkConfig):
     much more. The MLP learns less with it and has none."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         super().__post_init__()
         if self.features % self.heads:
             raise TaskError(f"features {self.features}: expected a multiple of heads {self.heads}")

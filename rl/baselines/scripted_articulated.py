@@ -160,10 +160,9 @@ class MotionPlanner:
         return abs(motion.goal - motion.position) * self._thing.lever
 
     def _tracks(self, motions: Sequence[Motion]) -> tuple[Array, Array, NDArray[np.intp]]:
-        """Return tracks (n, TRACK, dof), how far they move the object (n, TRACK), and whose.
+        """Return tracks (n, TRACK, dof), how far they move the object (n, TRACK), and whose (n,).
 
-        Both are NaN from where a track is not sound. Each attempt starts from other configurations.
-        The last result is the index of each track's motion, shape (n,).
+        The first two are NaN from where a track is not sound.
         """
         edge, finder = self._edge, self._finder
         position, to_go = (
@@ -202,9 +201,8 @@ class MotionPlanner:
     def _moves(self, tracks: Array, position: Array, sign: Array) -> Array:
         """Return how far robots on tracks (n, TRACK, dof) move the object, (n, TRACK) [m].
 
-        It moves on from its positions (n,) where they touch it, as if it stopped at once. It is
-        lower than it is, as where they graze its top they slip over it. NaN is from where it cannot
-        get out of their way.
+        It moves on from its positions (n,) where they touch it, as if it stopped at once; NaN is
+        from where it cannot get out of their way.
         """
         moves = np.full(tracks.shape[:2], np.nan)
         moves[:, 0], edge = 0.0, self._edge
@@ -217,7 +215,7 @@ class MotionPlanner:
                 while len(rows):
                     change = sign[rows] * moved[rows] / self._thing.lever
                     poses = self._thing.placed_joint.poses(position[rows] + change)
-                    poses[:, 2] -= _DEPTH * edge
+                    poses[:, 2] -= _DEPTH * edge  # robots that graze its top slip over it
                     rows = rows[~self._finder.links.free(q[rows], poses)]
                     moved[rows] += _MOVE * edge if tries < _MOVES else np.nan
                     tries += 1
@@ -376,7 +374,6 @@ class Scripted:
     """The scripted controllers of all tasks that have one, each for its own environments."""
 
     def __init__(self, seed: int) -> None:
-        """Set up; see the controllers."""
         self._push, self._articulated = ScriptedPush(seed), ScriptedArticulated(seed)
 
     def act(self, task: TaskBatch) -> torch.Tensor:

@@ -254,10 +254,8 @@ class PushPlanner:
         return results
 
     def _plan_along_tree(self, push: Push, start: Array) -> Found | None:
-        """Return the cheapest path along a tree of reachable configurations, if any.
-
-        Self-collisions may divide free space: the pre-contacts are near the tree.
-        """
+        """Return the cheapest path along a tree of reachable configurations, if any."""
+        # Self-collisions may divide free space: the pre-contacts are near the tree.
         no_goals = np.zeros((0, len(start)))
         _, tree = self._planner.plan_rrt(
             start, no_goals, block=push.block, attempt=push.attempt, iterations=_TREE_ITERATIONS
@@ -314,10 +312,7 @@ class PushPlanner:
         )
 
     def _candidates_near(self, pushes: Sequence[Push]) -> tuple[_Candidates, NDArray[np.intp]]:
-        """Return candidates from inverse kinematics that starts at random free configurations.
-
-        The second result is the index of each one's push, shape (n,).
-        """
+        """Return candidates from random free configurations, and the index of each push (n,)."""
         parts = []
         for push in pushes:
             bank = unwrap_joints(self._robot, push.q, self._bank)

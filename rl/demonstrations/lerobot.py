@@ -217,13 +217,7 @@ def _place(file_index: int) -> dict[str, int]:
 
 
 def _columns(arrays: Arrays, num_joints: int, sizes: Mapping[str, int]) -> Arrays:
-    """Return the columns of a shard by feature, without those that its place determines.
-
-    Args:
-        arrays: Arrays of the shard.
-        num_joints: Joints of the largest robot.
-        sizes: Sizes of the observation fields of all tasks.
-    """
+    """Return the columns of a shard by feature, without those that its place determines."""
     columns: Arrays = {}
     for name, source in JOINTS.items():
         if source in arrays:  # the last one only with noise

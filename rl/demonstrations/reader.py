@@ -329,10 +329,6 @@ class _RecordedStates(Simulation):
         self.q, self.qd = columns["observation.state"], columns["observation.velocity"]
         self.object_pose = columns["observation.object_pose"]
 
-    @property
-    def object_velocity(self) -> torch.Tensor:
-        raise NotImplementedError("recorded states have no velocities of objects")
-
     def faults(self) -> dict[int, str]:
         return {}
 

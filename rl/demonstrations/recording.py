@@ -48,6 +48,7 @@ from morphgen.rl.demonstrations.lerobot import (
     require_pyarrow,
     video_path,
 )
+from morphgen.rl.demonstrations.reader import Demonstrations
 from morphgen.rl.inference import EpisodeResults, make_controller, read_controller
 from morphgen.rl.runs.robot_source import (
     GrammarSource,
@@ -57,6 +58,7 @@ from morphgen.rl.runs.robot_source import (
     draw,
     identity,
     members,
+    robot_source,
     tasks_of,
 )
 from morphgen.splits.split import Member, compose_member
@@ -91,8 +93,8 @@ class RecordingConfig:
     policy: str = PLANNER
     """A baseline, a shipped policy, a checkpoint, or ``PLANNER``."""
     teacher: str = ""
-    """Policy whose actions are the labels, in the states that ``policy`` leads to (DAgger: Ross,
-    Gordon and Bagnell 2011); empty for those of ``policy``."""
+    """Policy whose actions are the labels, in the states that ``policy`` leads to; empty for those
+    of ``policy``. See ``record_states``."""
     episodes: int = 20
     """Number of episodes of each robot at each of its tasks."""
     seed: int = 0
@@ -217,6 +219,60 @@ def record(folder: Path, config: RecordingConfig, *, jobs: int = 1, ray: str | N
             raise
         shutil.rmtree(folder / SHARDS)
     return folder
+
+
+def read_planner(planner: str, tasks: Sequence[str]) -> None:
+    """Require a baseline that can do all tasks."""
+    for task in tasks:
+        name = best_of(task, planner)
+        if name not in BASELINES:
+            raise TaskError(f"{planner!r} is no baseline; valid: {', '.join(BASELINES)}")
+        read_controller(name, task)  # raises if it is not for the task
+
+
+def record_states(
+    data: Demonstrations,
+    folder: Path,
+    policy: str | Path,
+    planner: str,
+    *,
+    episodes: int,
+    seed: int,
+    jobs: int = 1,
+) -> Path:
+    """Let a policy act with the robots of a data set, and record a planner's actions (DAgger).
+
+    Ross, Gordon and Bagnell 2011, "A reduction of imitation learning and structured prediction to
+    no-regret online learning". A round is a data set of its own, with the goals of the other one.
+
+    Args:
+        data: Data set with the robots, their tasks and goals.
+        folder: The data set to record.
+        policy: Folder of the policy's run, or another policy.
+        planner: Baseline whose actions are the labels.
+        episodes: Number of episodes of each robot at each task.
+        seed: Seed of the episodes.
+        jobs: Number of processes.
+    """
+    sources = tuple(
+        robot_source(
+            str(data.folder / BODIES / data.robot_hashes[index]),
+            task,
+            obstacles=bool(spec.scene.obstacles),
+            goal_seed=spec.goals.seed,
+        )
+        for (index, task), spec in data.specs.items()
+    )
+    config = RecordingConfig(
+        sources,
+        policy=str(policy),
+        teacher=planner,
+        episodes=episodes,
+        seed=seed,
+        sim=data.settings["sim"],
+        goals=GoalConfig(tasks=data.configs),
+    )
+    return record(folder, config, jobs=jobs)
 
 
 def _shard(folder: Path, robot: str) -> Path:
@@ -362,10 +418,7 @@ def _run(
     config: RecordingConfig,
     generator: torch.Generator,
 ) -> tuple[EpisodeResults, list[dict[str, torch.Tensor]]]:
-    """Run an episode of every environment; return the results and all steps, (n, ...) each.
-
-    The first controller acts. The actions of the last one are the labels.
-    """
+    """Run an episode of every environment; return the results and all steps, (n, ...) each."""
     noise, hold = config.noise, config.hold
     batch.reset(seed=seeds)
     results = EpisodeResults(batch.num_envs, 1, batch.device)
@@ -377,7 +430,7 @@ def _run(
             batch.decode_actions(each.act(batch), mask.shape).where(mask, 0.0)
             for each in controllers
         )
-        action, executed = (labels or [acted])[-1], acted
+        action, executed = (labels or [acted])[-1], acted  # the first controller acts
         if noise:
             random = torch.randn(mask.shape, generator=generator).to(action)
             executed = (acted + noise * random).clamp(-1, 1).where(mask, 0.0)

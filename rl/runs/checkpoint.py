@@ -330,7 +330,6 @@ class RunConfig:
         return tuple(replace(task, num_goals=type(task)().num_goals) for task in self.tasks)
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if self.seed < 0:
             raise TaskError(f"--seed {self.seed}: expected 0 or more")
         if self.num_envs < 1:

@@ -346,7 +346,6 @@ class ExecutionConfig:
     """Time after which training stops with a checkpoint, to be resumed [min]; None for no limit."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if self.wandb:
             require_wandb()
         if self.workers is not None and self.workers < 1:

@@ -50,7 +50,6 @@ class ArticulatedConfig(ObjectTaskConfig):
     """Weights of the reward terms, those of push."""
 
     def __post_init__(self) -> None:
-        """Require constants that describe a motion."""
         super().__post_init__()
         low, high = self.size
         if not (self.travel > 0 and 0 < low <= high and self.friction >= 0):

@@ -170,6 +170,10 @@ class ArticulatedEnvs(TaskEnvs):
         self._end = torch.zeros(len(env_spec_index), 7, device=device)  # poses at the goals
         # Points before contact, in the frames of the objects' poses.
         self._before = torch.zeros(len(env_spec_index), 3, device=device)
+        # What an episode is drawn with.
+        formulas = self.formulas
+        self._drawn_numbers = formulas.start, formulas.goal, formulas.sign, formulas.travel
+        self._drawn_vectors = formulas.surface, self._end, self._before
 
     def begin(
         self, mask: torch.Tensor, random: EpisodeRandom, layout: torch.Tensor | None
@@ -179,18 +183,12 @@ class ArticulatedEnvs(TaskEnvs):
         start = self._choices.goals(layout, number[:, None])[:, 0]
         motion = self._motions[self._env_spec_index, start]
         pose, end, surface, before = torch.split(motion[:, 2:], [7, 7, 3, 3], dim=1)
-        formulas = self.formulas
-        for kept, drawn in (
-            (formulas.start, motion[:, 0]),
-            (formulas.goal, motion[:, 1]),
-            (formulas.sign, torch.sign(motion[:, 1] - motion[:, 0])),
-            (formulas.travel, self.fraction * (motion[:, 1] - motion[:, 0]).abs()),
-            (formulas.surface, surface),
-            (self._end, end),
-            (self._before, before),
-        ):
+        start_q, goal = motion[:, 0], motion[:, 1]
+        travel = self.fraction * (goal - start_q).abs()
+        drawn = (start_q, goal, torch.sign(goal - start_q), travel, surface, end, before)
+        for kept, new in zip((*self._drawn_numbers, *self._drawn_vectors), drawn, strict=True):
             rows = mask if kept.ndim == 1 else mask[:, None]
-            kept.copy_(torch.where(rows, drawn, kept))
+            kept.copy_(torch.where(rows, new, kept))
         return self._q[self._env_spec_index, start], pose
 
     def target_points(self, object_pose: torch.Tensor) -> torch.Tensor:
@@ -223,31 +221,23 @@ class ArticulatedEnvs(TaskEnvs):
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return the part of the travel, and what the running episodes were drawn with."""
-        formulas = self.formulas
-        drawn = (formulas.start, formulas.goal, formulas.sign, formulas.travel)
         return {
             "fraction": self.fraction.clone(),
-            "motion": torch.stack(drawn, dim=1),
-            "points": torch.cat([formulas.surface, self._end, self._before], dim=1),
+            "motion": torch.stack(self._drawn_numbers, dim=1),
+            "points": torch.cat(self._drawn_vectors, dim=1),
         }
 
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
         """Restore what ``state_dict`` returned."""
-        formulas = self.formulas
         self.fraction.copy_(state["fraction"])
-        drawn = (formulas.start, formulas.goal, formulas.sign, formulas.travel)
-        for kept, values in zip(drawn, state["motion"].unbind(1), strict=True):
-            kept.copy_(values)
         parts = torch.split(state["points"], [3, 7, 3], dim=1)
-        for kept, values in zip((formulas.surface, self._end, self._before), parts, strict=True):
+        stored = (*state["motion"].unbind(1), *parts)
+        for kept, values in zip((*self._drawn_numbers, *self._drawn_vectors), stored, strict=True):
             kept.copy_(values)
 
 
 def _motions(starts: ArticulatedStartSet) -> NDArray[np.float64]:
-    """Return rows of a set: start, goal, poses there, points on the surface and before, (S, 22).
-
-    The gap before the surface is scaled down for robots that reach less than 0.4 m.
-    """
+    """Return rows of a set: start, goal, poses there, points on the surface and before, (S, 22)."""
     thing, sign = starts.thing, np.sign(starts.goal - starts.start)
     ends = [thing.placed_joint.poses(each) for each in (starts.start, starts.goal)]
     points = [thing.behind(sign, gap) for gap in (0.0, GAP * starts.scale)]

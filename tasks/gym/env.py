@@ -308,9 +308,7 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         self._next_has_begun, self._final_states, self._final_physics = False, {}, None
         return self._in_goal_form(observation), {"self_collision": self._self_collision}
 
-    def step(
-        self, action: NDArray[Any]
-    ) -> tuple[NumpyObservation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[Any]) -> EnvStep:
         """Act for one control step."""
         self._require_running()
         action = self._checked(action)
@@ -421,11 +419,8 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
 
 
 def _limit_for_make() -> int | None:
-    """Return the ``max_episode_steps`` that ``gym.make`` was called with, if it was.
-
-    It gives them to a wrapper alone, which would be without effect beyond the task's limit; so they
-    are looked up in its frame.
-    """
+    """Return the ``max_episode_steps`` that ``gym.make`` was called with, if it was."""
+    # It gives them to a wrapper alone, which would be without effect beyond the task's limit.
     frame = currentframe()
     while frame is not None and frame.f_code is not gym.make.__code__:
         frame = frame.f_back

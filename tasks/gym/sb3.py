@@ -40,7 +40,6 @@ class SB3Vector(VecEnv):
     """
 
     def __init__(self, vector: TaskVector) -> None:
-        """Wrap environments; ``reset`` begins new episodes."""
         if vector.autoreset_mode is not AutoresetMode.SAME_STEP:
             raise TaskError("stable-baselines3 needs a vector with autoreset_mode SAME_STEP")
         self.vector = vector

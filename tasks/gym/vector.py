@@ -219,10 +219,7 @@ class BatchEnv:
     def _step_batch(
         self, actions: torch.Tensor, hold: torch.Tensor | None, *, keeps_ends: bool
     ) -> Step:
-        """Step the batch, which begins the next episode where one ends.
-
-        Where the last state is wanted for a picture, it is kept.
-        """
+        """Step the batch, which begins the next episode where one ends; keep the end to show it."""
         is_shown = self.render_mode is not None and keeps_ends
         count = self.batch.num_envs if is_shown else 0
         before = [render_state(self.batch, env) for env in range(count)]

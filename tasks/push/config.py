@@ -54,7 +54,6 @@ class PushConfig(ObjectTaskConfig):
     part of the score."""
 
     def __post_init__(self) -> None:
-        """Require constants that describe a push."""
         super().__post_init__()
         low, high = self.block_size
         if self.curriculum_steps < 1:

@@ -53,7 +53,6 @@ class ReachConfig(TaskConfig):
         return self.near / self.near_angle
 
     def __post_init__(self) -> None:
-        """Require constants that describe a reach."""
         super().__post_init__()
         if not self.near > 0:
             raise TaskError(f"near {self.near:g}: expected a positive distance [m]")

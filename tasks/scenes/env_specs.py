@@ -39,7 +39,6 @@ class GoalConfig:
     """Constants of tasks, at most one config of a type; other tasks have their defaults."""
 
     def __post_init__(self) -> None:
-        """Check the types."""
         if not isinstance(self.tasks, Sequence):
             raise TaskError(f"configs {self.tasks!r}: expected a list")
         object.__setattr__(self, "tasks", tuple(self.tasks))

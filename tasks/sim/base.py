@@ -135,19 +135,15 @@ class Simulation(ABC):
     object_pose: torch.Tensor
     """Poses in the world of the blocks, or of articulated objects at their contact points, which
     determine their joints: x, y, z, qw, qx, qy, qz, (n, 7); zeros without an object."""
+    object_velocity: torch.Tensor
+    """Linear velocities of the blocks in the world, (n, 3); zeros without one [m/s]."""
 
     def __init__(self, scenes: Sequence[Scene], device: torch.device) -> None:
-        """Keep the scene of each environment."""
         if not scenes:
             raise ValueError("there are no scenes; expected one or more")
         self.scenes, self.device = tuple(scenes), device
         self._num_obstacles = max(len(scene.obstacles) for scene in scenes)
         self._is_closed = False
-
-    @property
-    @abstractmethod
-    def object_velocity(self) -> torch.Tensor:
-        """Linear velocities of the blocks in the world, (n, 3); zeros without one [m/s]."""
 
     def reset(
         self,
@@ -264,7 +260,6 @@ class HostSimulation(Simulation):
     """A simulation on the CPU by a library that takes arrays of NumPy."""
 
     def __init__(self, scenes: Sequence[Scene]) -> None:
-        """Allocate targets."""
         import torch
 
         super().__init__(scenes, torch.device("cpu"))

@@ -47,7 +47,6 @@ class BulletSimulation(HostSimulation):
     def __init__(
         self, scenes: Sequence[Scene], contacts: Contacts | None = None, *, processes: int = 1
     ) -> None:
-        """Load every scene."""
         super().__init__(scenes)
         self.workers: list[Worker] = []
         self._unreset: set[int] = set()
@@ -79,18 +78,13 @@ class BulletSimulation(HostSimulation):
                     np.zeros((len(scenes), *part.shape[1:]), np.float32) for part in self._state
                 ]
             tensors = map(torch.from_numpy, self._state)
-            self.q, self.qd, self.object_pose, self._object_velocity = tensors
+            self.q, self.qd, self.object_pose, self.object_velocity = tensors
             for worker in self.workers:
                 worker.receive()
             self._go_home()
         except BaseException:
             self.close()
             raise
-
-    @property
-    def object_velocity(self) -> torch.Tensor:
-        """Velocities of the blocks; see ``Simulation.object_velocity``."""
-        return self._object_velocity
 
     def close(self) -> None:
         """Free the clients and end the workers; a second call does nothing."""
@@ -126,10 +120,9 @@ class BulletSimulation(HostSimulation):
         return faults
 
     def _call(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> dict[int, str]:
-        """Call a method of the batches of this process and of workers, and read their states.
+        """Call a method of the batches of all processes, and read their states.
 
-        Return the reason for each environment that diverged. An interruption closes the simulation:
-        it leaves answers in the pipes that nobody reads.
+        Return the reason for each environment that diverged.
         """
         mine, *others = arguments
         try:
@@ -138,7 +131,7 @@ class BulletSimulation(HostSimulation):
             answers = [(getattr(self.batch, method)(*mine), self.batch.state)]
             answers += [worker.receive() for worker in self.workers]
         except BaseException:
-            self.close()
+            self.close()  # an interruption leaves answers in the pipes that nobody reads
             raise
         found: dict[int, str] = {}
         for envs, rows, (faults, state) in zip(self._shares, self._rows, answers, strict=True):

@@ -160,13 +160,11 @@ class MotorForces:
 def _inertia(robot: Robot) -> tuple[Array, Array]:
     """Return forces on movable joints per acceleration of independent joints, (dof, movable).
 
-    The second array is that per squared velocity of independent joints, which is zero for joints
-    that are no mimic joints.
-
-    Each joint of a mimic group has a motor of its own: it carries what accelerates its own link,
-    while the inertia of the group is that of all, in which two fingers that move apart cancel. In
-    the group it also carries what others do to a part of it, such as the reaction of a motor on
-    the rod of a parallelogram: up to sqrt(M_jj M_kk), which bounds M_jk away from home.
+    The second array is that per squared velocity, which is zero but for mimic joints. Each joint of
+    a mimic group has a motor of its own: it carries what accelerates its own link, while in the
+    inertia of the group two fingers that move apart cancel. It also carries what others do to a
+    part of the group, such as the reaction of a motor on the rod of a parallelogram: up to
+    sqrt(M_jj M_kk), which bounds M_jk away from home.
     """
     matrix, _ = robot.mimic_map
     gains = np.abs(matrix)
@@ -216,7 +214,6 @@ class BulletScene:
     """
 
     def __init__(self, scene: Scene, exported: Exported, contacts: Contacts) -> None:
-        """Load the robot and its surroundings."""
         self._scene, self._contacts = scene, contacts
         self.id: int = pybullet.connect(pybullet.DIRECT)
         if self.id < 0:
@@ -625,10 +622,8 @@ class BulletBatch:
     def _undisturbed(self, desired: Array) -> tuple[Array, Array]:
         """Return positions and velocities at the end of a control step without disturbances.
 
-        Integrates the critically damped law of ``morphgen.model.dynamics`` in physics steps.
-        Effort limits and contacts are not modelled: they show in the velocity that is measured
-        afterwards, and carry over to the next step. Mimic joints follow where their leaders are,
-        not the leaders' targets: a leader at its effort limit is late.
+        Effort limits and contacts show in the velocity that is measured afterwards, and carry over
+        to the next step.
         """
         q, v = self._positions, self._velocities
         fastest, slowest = self._fastest, -self._fastest
@@ -636,6 +631,7 @@ class BulletBatch:
             v = v + _RESPONSE * (_BANDWIDTH * (desired - q) - _TWO * v)
             v = np.minimum(np.maximum(v, slowest), fastest)
             q = q + _TIMESTEP * v
+        # Mimic joints follow where their leaders are: a leader at its effort limit is late.
         return q[self._leaders] * self._gain + self._offset, v[self._leaders] * self._gain
 
     def _find_diverged(self) -> dict[int, str]:

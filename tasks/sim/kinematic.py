@@ -46,7 +46,6 @@ class KinematicSimulation(Simulation):
         *,
         device: torch.device | str = "cpu",
     ) -> None:
-        """Put every robot at home."""
         super().__init__(scenes, torch.device(device))
         if contacts not in (None, NO_CONTACTS):
             raise SimulationError(
@@ -68,14 +67,9 @@ class KinematicSimulation(Simulation):
         n = len(scenes)
         self.qd = torch.zeros_like(self.q)
         self.object_pose = torch.zeros(n, 7, device=self.device)
-        self._object_velocity = torch.zeros(n, 3, device=self.device)
+        self.object_velocity = torch.zeros(n, 3, device=self.device)
         self._diverged = torch.zeros(n, dtype=torch.bool, device=self.device)
         self._on_host = is_host(self.device)
-
-    @property
-    def object_velocity(self) -> torch.Tensor:
-        """Zeros; see ``Simulation.object_velocity``."""
-        return self._object_velocity
 
     def _reset(
         self,

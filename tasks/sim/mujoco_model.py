@@ -111,11 +111,9 @@ def worlds(scenes: Sequence[Scene], contacts: Contacts) -> list[World]:
 
 
 def _robot_spec(robot: Robot, contacts: Contacts) -> tuple[Robot, mujoco.MjSpec]:
-    """Return the robot after ``merge_rigid_links`` and its spec, whose root can be moved.
-
-    Joints have no friction and damping of their own: the law of position control moves them.
-    """
+    """Return the robot after ``merge_rigid_links`` and its spec, whose root can be moved."""
     robot = merge_rigid_links(robot)
+    # Joints have no friction and damping of their own: the law of position control moves them.
     bare = replace(
         robot, joints=tuple(replace(joint, damping=0.0, friction=0.0) for joint in robot.joints)
     )

@@ -49,7 +49,6 @@ class GatheredArrays:
     """
 
     def __init__(self, arrays: Sequence[Array]) -> None:
-        """Allocate the memory; ``read`` copies."""
         self._arrays = [*arrays, np.zeros(1)]
         ends = np.cumsum([len(array) for array in self._arrays])
         self.begin = np.concatenate([[0], ends[:-1]])  # index in `flat` where each array begins
@@ -64,7 +63,6 @@ class MujocoState:
     """Tensors of joints and blocks, gathered from the data of all environments at once."""
 
     def __init__(self, worlds: Sequence[World], data: Sequence[mujoco.MjData]) -> None:
-        """Prepare; ``read`` fills the tensors."""
         n, joints = len(worlds), max(world.robot.dof for world in worlds)
         positions = [env_data.qpos for env_data in data]
         velocities = [*(env_data.qvel for env_data in data), np.zeros(1)]
@@ -76,31 +74,27 @@ class MujocoState:
         """``qvel`` of all environments at the last ``read``, concatenated, and a zero."""
         self._warnings = self._numbers.flat[begin[2 * n + 1] : -1].reshape(n, -1)
         self._joints_at = np.full((2, n, joints), -1)
-        self._pose_at = np.full((n, 7), -1)
-        self._velocity_at = np.full((n, 3), -1)
+        self._block_at = np.full((n, 10), -1)  # pose and linear velocity
         for i, world in enumerate(worlds):
             dof = world.robot.dof
             self._joints_at[0, i, :dof] = begin[i] + world.q_at
             self._joints_at[1, i, :dof] = begin[n + i] + world.qd_at
             if len(world.block_q_at):
-                self._pose_at[i] = begin[i] + world.block_q_at
-                self._velocity_at[i] = begin[n + i] + world.block_qd_at
+                self._block_at[i, :7] = begin[i] + world.block_q_at
+                self._block_at[i, 7:] = begin[n + i] + world.block_qd_at
         objects = {i: world.object for i, world in enumerate(worlds) if world.object is not None}
         self._articulated = [*objects]
         self._object_at = [begin[i] + worlds[i].object_q_at[0] for i in objects]
         self._object_joints = ObjectJoints([*objects.values()]) if objects else None
-        self._has_blocks = bool((self._pose_at >= 0).any())
+        self._has_blocks = bool((self._block_at >= 0).any())
         self._joints = np.zeros((2, n, joints), np.float32)
         self._object_pose = np.zeros((n, 7), np.float32)
+        self._object_velocity = np.zeros((n, 3), np.float32)
         self.joints = np.zeros((2, n, joints))
         """Joint positions and velocities at the last ``read``, shape (2, n, J)."""
         self.q, self.qd = map(torch.from_numpy, self._joints)
         self.object_pose = torch.from_numpy(self._object_pose)
-
-    @property
-    def object_velocity(self) -> torch.Tensor:
-        """Linear velocities of the blocks at the last ``read``, shape (n, 3)."""
-        return torch.from_numpy(self._numbers.flat[self._velocity_at].astype(np.float32))
+        self.object_velocity = torch.from_numpy(self._object_velocity)
 
     def read(self) -> None:
         """Update the tensors from the data."""
@@ -108,10 +102,10 @@ class MujocoState:
         self.joints = self._numbers.flat[self._joints_at]
         self._joints[:] = self.joints
         if self._has_blocks:
-            pose = self._numbers.flat[self._pose_at]
-            quaternion = pose[:, 3:]
+            blocks = self._numbers.flat[self._block_at]
+            quaternion = blocks[:, 3:7]
             quaternion *= np.where(quaternion[:, :1] < 0, -1.0, 1.0)  # w >= 0, as everywhere
-            self._object_pose[:] = pose
+            self._object_pose[:], self._object_velocity[:] = blocks[:, :7], blocks[:, 7:]
         if self._object_joints is not None:
             positions = self._numbers.flat[self._object_at]
             self._object_pose[self._articulated] = self._object_joints.poses(positions)
@@ -161,7 +155,6 @@ class PositionControl:
     """
 
     def __init__(self, worlds: Sequence[World], data: Sequence[mujoco.MjData], joints: int) -> None:
-        """Prepare."""
         self._shape = (len(worlds), joints)
         bias = [env_data.qfrc_bias for env_data in data]
         weight = [env_data.qfrc_gravcomp for env_data in data]
@@ -219,7 +212,10 @@ Work = tuple[int, mujoco.MjModel, mujoco.MjData, Array, Array, Array, Array]
 and of its applied forces in the data and in ``PositionControl``."""
 
 
-_VIEWS = {"_state", "q", "qd", "object_pose", "_control", "_work", "_seen", "_warnings", "_pool"}
+_VIEWS = {
+    *("_state", "q", "qd", "object_pose", "object_velocity"),
+    *("_control", "_work", "_seen", "_warnings", "_pool"),
+}
 """Attributes that ``_view_data`` makes."""
 
 
@@ -241,7 +237,6 @@ class MujocoSimulation(HostSimulation):
     def __init__(
         self, scenes: Sequence[Scene], contacts: Contacts | None = None, *, threads: int = 1
     ) -> None:
-        """Compile the scenes."""
         super().__init__(scenes)
         self._worlds = worlds(self.scenes, contacts or Contacts())
         self._data = [mujoco.MjData(world.model) for world in self._worlds]
@@ -255,6 +250,7 @@ class MujocoSimulation(HostSimulation):
         self._state = MujocoState(self._worlds, self._data)
         self.q, self.qd = self._state.q, self._state.qd
         self.object_pose = self._state.object_pose
+        self.object_velocity = self._state.object_velocity
         self._control = PositionControl(self._worlds, self._data, self._targets.shape[1])
         self._work: list[Work] = []
         for i, (world, data) in enumerate(zip(self._worlds, self._data, strict=True)):
@@ -275,11 +271,6 @@ class MujocoSimulation(HostSimulation):
         vars(self).update(state)
         self._view_data()
         self._state.read()
-
-    @property
-    def object_velocity(self) -> torch.Tensor:
-        """Velocities of the blocks; see ``Simulation.object_velocity``."""
-        return self._state.object_velocity
 
     def close(self) -> None:
         """Free everything; a second call does nothing."""

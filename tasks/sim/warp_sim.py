@@ -153,11 +153,7 @@ def put_model(structure: Structure, device: str) -> Model:
 
 
 def _put_pairs(model: Model, structure: Structure) -> None:
-    """Have every world test its own pairs.
-
-    Those that some worlds test become contact pairs of MuJoCo, which have a margin for every world,
-    with the material that all of them have; see ``_have_one_material``.
-    """
+    """Have every world test its own pairs: those that some test have a margin for each world."""
     pairs, some = structure.pairs, ~structure.tested.all(axis=0)
     count, first = int(some.sum()), structure.worlds[0].model
     numbers = np.full_like(pairs, -1)
@@ -229,15 +225,8 @@ def _comparable(value: Any) -> object:  # noqa: ANN401  # fields of any type
 
 def _same_indices(first: World, other: World) -> bool:
     """Return whether two worlds have joints, block and obstacles at the same indices."""
-    names = (
-        "q_at",
-        "qd_at",
-        "movable_q_at",
-        "movable_qd_at",
-        "obstacles",
-        "block_q_at",
-        "object_q_at",
-    )
+    names = ("q_at", "qd_at", "movable_q_at", "movable_qd_at")
+    names += ("obstacles", "block_q_at", "object_q_at")
     return all(
         np.array_equal(getattr(first, name), getattr(other, name)) for name in names
     ) and np.array_equal(dof_leaders(first)[0], dof_leaders(other)[0])
@@ -467,7 +456,6 @@ class WarpSimulation(Simulation):
         *,
         device: torch.device | str = "cuda",
     ) -> None:
-        """Compile the scenes."""
         super().__init__(scenes, torch.device(device))
         wp.config.log_level = wp.LOG_WARNING
         compiled = worlds(self.scenes, contacts or Contacts())
@@ -483,7 +471,9 @@ class WarpSimulation(Simulation):
             ("mask", (n,), torch.uint8),
         ):
             tensors[name] = torch.zeros(shape, dtype=dtype, device=self.device)
-        self.q, self.qd, self.object_pose = (tensors[name] for name in ("q", "qd", "object_pose"))
+        self.q, self.qd, self.object_pose, self.object_velocity = (
+            tensors[name] for name in ("q", "qd", "object_pose", "object_velocity")
+        )
         self.counts, self._tensors = tensors["counts"], tensors
         self._obstacle_poses = torch.zeros(n, self._num_obstacles, 7, device=self.device)
         buffers = {name: wp.from_torch(tensor) for name, tensor in tensors.items()}
@@ -496,11 +486,6 @@ class WarpSimulation(Simulation):
         self._graph = _StepGraph(name, self._groups) if self.device.type == "cuda" else None
         self._go_home()
         self.counts.zero_()  # capturing ran steps
-
-    @property
-    def object_velocity(self) -> torch.Tensor:
-        """Velocities of the blocks; see ``Simulation.object_velocity``."""
-        return self._tensors["object_velocity"]
 
     def _reset(
         self,
@@ -560,7 +545,6 @@ class _StepGraph:
     """
 
     def __init__(self, device: str, groups: Sequence[Group]) -> None:
-        """Load the kernels and capture the steps."""
         load_kernels(groups, device)
         self._device = device
         with wp.ScopedDevice(device):

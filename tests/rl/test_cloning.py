@@ -9,7 +9,7 @@ import morphgen
 from helpers.runs import equal
 from morphgen.errors import TaskError
 from morphgen.rl.demonstrations.cloning import recorded_source, returns_of
-from morphgen.rl.demonstrations.dagger import record_states
+from morphgen.rl.demonstrations.recording import record_states
 from morphgen.rl.runs.checkpoint import read_checkpoint
 
 pytest.importorskip("pyarrow")

@@ -19,7 +19,6 @@ from morphgen.rl.config import PolicyConfig
 from morphgen.rl.inference import run_episodes
 from morphgen.rl.observation_layout import layout_of
 from morphgen.rl.policies import make_networks
-from morphgen.tasks.clearance import box_distance, capsule_box_distance, compile_capsules
 from morphgen.tasks.kinematic_channels import (
     CLEARANCES,
     COLUMN_SCALE,
@@ -28,6 +27,9 @@ from morphgen.tasks.kinematic_channels import (
     POSITION_SCALE,
     ROTATION_SCALE,
     SOLVED,
+    box_distance,
+    capsule_box_distance,
+    compile_capsules,
 )
 from morphgen.tasks.observation import MAX_TREE_DISTANCE, NUM_POINTS, observation_config
 from morphgen.tasks.push.config import PushConfig
