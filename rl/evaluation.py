@@ -185,10 +185,20 @@ def evaluate(
     random_episodes = _random_episodes(source, replace(config, workers=1), tasks)
     hashes = {member.name: member.robot_hash for member in members(source)}
     of_one = source.robot_hash if isinstance(source, OneRobot) else ""
-    return [
-        _score(spec, side_of(source), hashes.get(spec.robot.name, of_one), own, of_random)
-        for spec, own, of_random in zip(specs, episodes, random_episodes, strict=True)
-    ]
+    scores = []
+    for spec, own, of_random in zip(specs, episodes, random_episodes, strict=True):
+        outcomes = RobotOutcomes(
+            robot=spec.robot.name,
+            side=side_of(source),
+            task=spec.task,
+            body=hashes.get(spec.robot.name, of_one),
+            goal_set=spec.goals.key,
+            **{name: tuple(getattr(each, name) for each in own) for name in LISTS},
+            random_score=tuple(each.score for each in of_random),
+            random_success=tuple(each.success for each in of_random),
+        )
+        scores.append(score_of(outcomes, [each.angle for each in own], reach(spec.robot)))
+    return scores
 
 
 @show_progress(None)  # goal sets are not episodes
@@ -305,27 +315,6 @@ def episodes_again(
         with closing(batch), part_of(len(chosen), i):
             found.append(run_episodes(batch, make(), earlier + 1)[-1])
     return found
-
-
-def _score(
-    spec: EnvSpec,
-    side: Side,
-    robot_hash: str,
-    episodes: Sequence[Episode],
-    random_episodes: Sequence[Episode],
-) -> Score:
-    """Return the score of a robot from its episodes and those of the random policy."""
-    outcomes = RobotOutcomes(
-        robot=spec.robot.name,
-        side=side,
-        task=spec.task,
-        body=robot_hash,
-        goal_set=spec.goals.key,
-        **{name: tuple(getattr(each, name) for each in episodes) for name in LISTS},
-        random_score=tuple(each.score for each in random_episodes),
-        random_success=tuple(each.success for each in random_episodes),
-    )
-    return score_of(outcomes, [each.angle for each in episodes], reach(spec.robot))
 
 
 def eval_config_of(

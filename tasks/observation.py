@@ -371,16 +371,15 @@ class PointClouds:
         mask: Existing points, shape (n, P), bool.
     """
 
-    def __init__(self, scenes: Sequence[Scene], num_points: int, device: torch.device) -> None:
-        n, num_obstacles = len(scenes), max(len(scene.obstacles) for scene in scenes)
+    def __init__(
+        self, scenes: Sequence[Scene], obstacle_sizes: torch.Tensor, num_points: int
+    ) -> None:
+        n, device = len(scenes), obstacle_sizes.device
         self._local = torch.zeros(n, num_points, 3, device=device)
         self._on_block = torch.zeros(n, num_points, dtype=torch.bool, device=device)
         # Box 0 is the object, and the others are the obstacles; missing ones have no size.
-        sizes = torch.zeros(n, 1 + num_obstacles, 3)
-        sizes[:, 0], centres = _object_boxes(scenes).unbind(1)
-        for i, scene in enumerate(scenes):
-            for k, box in enumerate(scene.obstacles, start=1):
-                sizes[i, k] = torch.tensor(box.size)
+        edges, centres = _object_boxes(scenes).unbind(1)
+        sizes = torch.cat([edges[:, None], obstacle_sizes.cpu()], dim=1)
         self._sizes, self._centre = sizes.to(device), centres[:, None].to(device)
         x, y, z = sizes.double().unbind(2)
         # Areas of the faces across x, y and z of all boxes, added up, as fractions of their sum.
@@ -488,7 +487,7 @@ class BatchObservation:
             )
         self._points: PointClouds | None = None
         if config.points:
-            self._points = PointClouds(scenes, config.points, device)
+            self._points = PointClouds(scenes, layouts.sizes, config.points)
             self._constant_entries["point_mask"] = self._points.mask
 
     def begin(self, mask: torch.Tensor, random: EpisodeRandom) -> None:

@@ -54,9 +54,11 @@ def place_episodes(
             continue  # which is free as it was drawn
         blocks = None if spec.scene.object is None else block[None]
         if not space.free(start[None], blocks)[0]:
+            another = "; another seed draws another layout of the obstacles"
+            another *= bool(spec.scene.obstacles)
             raise TaskError(
                 f"reset: {robot.name!r} at {spec.task}: the start q {_text(start)} collides "
-                f"with itself or the scene{_among(spec)}"
+                f"with itself or the scene{another}"
             )
         q[env, : robot.dof] = torch.from_numpy(start)
         object_pose[env] = torch.from_numpy(block)
@@ -119,8 +121,3 @@ def unit_quaternion(values: Array, name: str) -> Array:
 
 def _text(vector: Array) -> str:
     return f"({', '.join(f'{number:g}' for number in vector)})"
-
-
-def _among(spec: EnvSpec) -> str:
-    """Return a hint for scenes whose obstacles differ from episode to episode."""
-    return "; another seed draws another layout of the obstacles" if spec.scene.obstacles else ""

@@ -28,6 +28,7 @@ from morphgen.rl.demonstrations.reader import Demonstrations
 from morphgen.rl.demonstrations.recording import (
     PLANNER,
     RecordingConfig,
+    best_of,
     read_planner,
     record_states,
 )
@@ -129,7 +130,7 @@ def record(
         sim=sim or DEFAULT_SIMULATOR,
     )
     names = tuple(dict.fromkeys(task for source in sources for task in tasks_of(source)))
-    own = (read_controller(config.policy_for(task), task).task_config for task in names)
+    own = (read_controller(best_of(task, config.policy), task).task_config for task in names)
     config = replace(config, goals=GoalConfig(tasks=with_goal(own, goal, names)))
     folder = record_episodes(
         path_argument("out", out or "demos", TaskError), config, jobs=jobs, ray=ray

@@ -19,20 +19,14 @@ from morphgen.model.kinematics import unwrap_joints
 from morphgen.rl.baselines.path_planner import (
     Path,
     PathCost,
-    PathFollower,
     PathPlanner,
-    fractions_towards,
 )
 from morphgen.rl.baselines.scripted_push import (
-    ARRIVED,
     LEAD_STEP,
-    MAX_PLANS,
-    SETTLE_STEPS,
     SPEED,
+    ScriptedController,
     ScriptedPush,
-    envs_by_planner,
 )
-from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.articulated.envs import ArticulatedEnvs
 from morphgen.tasks.articulated.starts import ArticulatedStartSet, PathFinder
 from morphgen.tasks.batch import TaskBatch
@@ -67,9 +61,6 @@ LEAD, MAX_LEAD = 0.03, 0.25
 MOVING = 0.02  # speed of the contact point from which the object counts as moving [m/s]
 PATIENCE = 50  # control steps in which the object must move by ``PROGRESS``; else plan again
 PROGRESS = MOVING * PATIENCE * CONTROL_PERIOD  # [m]
-MAX_FAILED = 2
-"""Number of plans of an episode that may find no path: each takes seconds, and after two, none was
-seen to find one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,43 +220,11 @@ class MotionPlanner:
         return q if self._space.free([q], pose)[0] else track[min(max(int(along), 0), TRACK - 1)]
 
 
-class ScriptedArticulated:
-    """Gets behind the object, follows its path in closed loop, and plans again where that fails.
-
-    Environments of other tasks stand still.
-    """
-
-    def __init__(self, seed: int) -> None:
-        """Set up; plans depend on the seed, the robot, its starts and the state of the episode."""
-        self._seed = seed
-        self._specs: Sequence[EnvSpec] = ()
-        self._planners: dict[int, MotionPlanner] = {}
-        self._task: TaskBatch | None = None
-
-    def act(self, task: TaskBatch) -> torch.Tensor:
-        """Return a step along the path behind the object, or along the track; shape (n, L)."""
-        if self._specs is not task.specs:
-            self._specs, self._planners = task.specs, {}
-        if self._task is not task:
-            self._begin(task)
-        position, goal = self._positions(task)
-        ours = self.ours & ~task.is_idle
-        self._active &= ours
-        new = ours & (task.episode_step == 0)
-        self._num_plans[new], self._num_failed[new] = 0, 0
-        failed = self._advance(task, position) | (ours & ~self._active)
-        left = (self._num_plans < MAX_PLANS) & (self._num_failed < MAX_FAILED)
-        self._pushing &= ~new
-        for (robot, _), envs in envs_by_planner(task, new | (failed & left)):
-            self._plan(task, robot, envs, position, goal)
-        on_track = self._on_track(self._track)
-        targets = torch.where(self._pushing[:, None], on_track, self._follower.waypoint)
-        targets = torch.where(self._active[:, None], targets, task.targets)
-        return encode_actions(fractions_towards(task, targets), task.action_kind)
+class ScriptedArticulated(ScriptedController):
+    """Gets behind the object, follows its path in closed loop, and plans again where that fails."""
 
     def _begin(self, task: TaskBatch) -> None:
-        """Allocate the state of a batch: a row per environment, without plans."""
-        self._task, self._follower = task, PathFollower(task)
+        super()._begin(task)
         n, device = task.num_envs, task.device
         names = {spec.task for spec in task.specs}
         self._groups = [
@@ -273,12 +232,8 @@ class ScriptedArticulated:
             for name in sorted(names)
             if isinstance(envs := task.groups[name], ArticulatedEnvs)
         ]
-        self.ours, self._active, self._pushing = torch.zeros(3, n, dtype=torch.bool, device=device)
         for rows, _ in self._groups:
-            self.ours[rows] = True
-        self._num_plans, self._num_failed, self._settling, self._still = torch.zeros(
-            4, n, dtype=torch.int64, device=device
-        )
+            self._ours[rows] = True
         self._track = task.targets[:, None].repeat(1, TRACK, 1)
         self._moves = torch.zeros(n, TRACK, device=device)
         self._step, self._length = torch.zeros(2, n, device=device)  # of the track
@@ -298,25 +253,18 @@ class ScriptedArticulated:
             goal[rows] = formulas.goal
         return position, goal
 
-    def _plan(
-        self,
-        task: TaskBatch,
-        robot: int,
-        envs: Sequence[int],
-        position: torch.Tensor,
-        goal: torch.Tensor,
-    ) -> None:
-        """Make plans in environments of a robot; positions and goals of all joints are (n,)."""
+    def _plan(self, task: TaskBatch, key: tuple[int, int], envs: Sequence[int]) -> None:
+        robot, (position, goal) = key[0], self._positions(task)
         spec = task.specs[robot]
-        if robot not in self._planners:
+        if key not in self._planners:
             rng = np.random.default_rng([self._seed, robot])
-            self._planners[robot] = MotionPlanner(spec, task.robot_tables, robot, rng)
-        planner, dof = self._planners[robot], spec.robot.dof
+            self._planners[key] = MotionPlanner(spec, task.robot_tables, robot, rng)
+        planner, dof = self._planners[key], spec.robot.dof
         now = [task.targets[env, :dof].double().cpu().numpy() for env in envs]
         motions = []
         for env, q in zip(envs, now, strict=True):
             start, at = q, float(position[env])
-            if self._pushing[env]:
+            if self.pushing[env]:
                 moved = float((position[env] - self._begun[env]) * self._lever[env])
                 track = self._track[env, :, :dof].double().cpu().numpy()
                 start = planner.retreat(q, track, moved / float(self._step[env]), at)
@@ -325,7 +273,7 @@ class ScriptedArticulated:
                 Motion(start, at, float(goal[env]), int(self._num_plans[env]), steps_left)
             )
         self._num_plans[envs] += 1
-        self._active[envs] = self._pushing[envs] = False
+        self._active[envs] = self.pushing[envs] = False
         lever = spec.goals.thing.lever  # type: ignore[attr-defined]  # a set of this task
         for env, q, motion, plan in zip(envs, now, motions, planner.plan(motions), strict=True):
             if plan is None:
@@ -340,25 +288,24 @@ class ScriptedArticulated:
             self._begun[env], self._best[env], self._along[env] = motion.position, 0.0, 0.0
             self._lead[env], self._settling[env], self._still[env] = LEAD, 0, 0
 
-    def _advance(self, task: TaskBatch, position: torch.Tensor) -> torch.Tensor:
-        """Go on along the paths and tracks; return where pushes failed, (n,), bool."""
-        at_end = self._active & ~self._pushing & self._follower.advance()
-        self._settling = torch.where(at_end, self._settling + 1, self._settling)
-        arrived = (task.q - task.targets).abs().amax(dim=1) < ARRIVED
-        self._pushing = self._pushing | (at_end & (arrived | (self._settling > SETTLE_STEPS)))
-        moved = (position - self._begun) * self._lever
+    def _advance(self, task: TaskBatch) -> torch.Tensor:
+        self._follow_paths(task)
+        moved = (self._positions(task)[0] - self._begun) * self._lever
         progress = moved > self._best + PROGRESS
         self._best = torch.where(progress, moved, self._best)
         expected = self._on_track(self._moves)
         self._still = torch.where(progress | (expected == 0), 0, self._still + 1)
         ahead = expected - moved
-        grow = self._pushing & (self._still > 2) & (ahead > self._lead - SPEED)
+        grow = self.pushing & (self._still > 2) & (ahead > self._lead - SPEED)
         self._lead = torch.where(grow, self._lead + LEAD_STEP, self._lead).clamp(max=MAX_LEAD)
-        go = self._pushing & (ahead < self._lead)
+        go = self.pushing & (ahead < self._lead)
         self._along = torch.minimum(self._along + torch.where(go, SPEED, 0.0), self._length)
-        stuck = self._pushing & (self._still > PATIENCE)
+        stuck = self.pushing & (self._still > PATIENCE)
         failed: torch.Tensor = self._active & (stuck | (moved < -PROGRESS))
         return failed
+
+    def _push(self, task: TaskBatch) -> torch.Tensor:
+        return self._on_track(self._track)
 
     def _on_track(self, values: torch.Tensor) -> torch.Tensor:
         """Return values along tracks (n, TRACK, ...) where the commanded tools are, (n, ...)."""

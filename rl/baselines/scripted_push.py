@@ -7,10 +7,11 @@ the block until both collide.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
-from typing import Self, TypeAlias
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 import torch
@@ -183,17 +184,13 @@ class PushPlanner:
         self._friction = starts.block.friction * starts.block.mass * GRAVITY
         self._stiffness = np.array([gain.stiffness for gain in actuation(self._robot)])
         self._idle = ~tables.moves_tool[robot, : self._robot.dof].cpu().numpy()
-        self._space = FreeSpace(scene)
+        self.space = FreeSpace(scene)
         step = tables.max_step[robot, : self._robot.dof].double().cpu().numpy()
-        self._planner = PathPlanner(self._space, step, int(rng.integers(2**63)))
+        self._planner = PathPlanner(self.space, step, int(rng.integers(2**63)))
         edge, first, last = self._edge, starts.blocks.min(axis=0), starts.blocks.max(axis=0)
         low = np.array([first[0] - edge, first[1] - 2.5 * edge, self._ground])
         high = np.array([last[0] + edge, self._line + edge, self._ground + 1.5 * edge])
-        self._bank, self._bank_tools = sample_tools_in_box(self._space, low, high, rng)
-
-    def free(self, q: Array) -> NDArray[np.bool_]:
-        """Return whether configurations (n, dof) are free of collisions without the block, (n,)."""
-        return self._space.free(q)
+        self._bank, self._bank_tools = sample_tools_in_box(self.space, low, high, rng)
 
     def plan(self, pushes: Sequence[Push]) -> list[Plan | None]:
         """Return the cheapest plan of each push.
@@ -358,12 +355,12 @@ class PushPlanner:
         q, error = solve_position_ik(self._robot, starts, goals)
         good = (np.abs(error[:, :2]) < _TOLERANCE * self._edge).all(axis=1)
         good &= np.abs(error[:, 2]) < self._edge / 2
-        good[good] = self._space.free(q[good], blocks[good])
+        good[good] = self.space.free(q[good], blocks[good])
         return q[good], np.flatnonzero(good)
 
     def _candidates(self, q: Array, blocks: Array) -> _Candidates:
         """Return those configurations behind their blocks (n, dof) that touch them along y."""
-        contacts = find_contacts(self._space, q, blocks, self._edge)
+        contacts = find_contacts(self.space, q, blocks, self._edge)
         position, rotation = self._tool.poses(contacts.q)
         _, J = frame_jacobian(self._robot, contacts.q)
         compliance = self._friction * (J[:, 1] ** 2 / self._stiffness).sum(axis=1)
@@ -391,7 +388,7 @@ class PushPlanner:
         good, finished = np.ones(len(q), dtype=np.bool_), np.zeros(len(q))
         centred = block.copy()
         centred[:, 0] += each.offset
-        over = overhang(self._space, q, centred, edge)
+        over = overhang(self.space, q, centred, edge)
         goal = each.position.copy()
         # In this order: plans, and the data sets of them, depend on the last bits.
         goal[:, 0] = block[:, 0] + (each.position[:, 0] - block[:, 0] - each.offset)
@@ -401,12 +398,12 @@ class PushPlanner:
             q = self._tool.move_towards(q, goal, each.rotation, 4)
             error = np.abs(self._tool.poses(q)[0][:, :2] - goal[:, :2]).max(axis=1)
             good &= error < _TOLERANCE * edge + 0.002
-            good[good] = self._space.free(q[good])
+            good[good] = self.space.free(q[good])
             moved = np.maximum(ahead - gap, 0)
             touching = np.flatnonzero(good & (ahead >= gap))
             shifts = moved[touching, None] + np.array([-_NEARER, _FARTHER]) * edge
             nearer, farther = touches(
-                self._space, q[touching], block[touching], np.zeros(1), shifts
+                self.space, q[touching], block[touching], np.zeros(1), shifts
             ).T
             good[touching] = nearer & ~farther
             finished[good] = i / _SIMULATED
@@ -414,7 +411,7 @@ class PushPlanner:
                 rows = np.flatnonzero(good & (over < MAX_OVERHANG))
                 ahead_of = block[rows]
                 ahead_of[:, 1] += moved[rows] + _FARTHER * edge
-                over[rows] = np.maximum(over[rows], overhang(self._space, q[rows], ahead_of, edge))
+                over[rows] = np.maximum(over[rows], overhang(self.space, q[rows], ahead_of, edge))
         begun = finished * length > gap + 0.1 * edge
         cost = _push_cost(each, finished, over)
         candidates.cost[chosen] = np.where(begun, cost, np.inf)
@@ -431,7 +428,7 @@ class PushPlanner:
 
     def _retreat(self, q: Array, block: Array) -> Array:
         """Return q if it is free of the block, else a free one near it, else q."""
-        if self._space.free(q[None], block[None])[0]:
+        if self.space.free(q[None], block[None])[0]:
             return q
         position, rotation = self._tool.poses(q[None])
         for direction in _RETREAT_DIRECTIONS:
@@ -439,7 +436,7 @@ class PushPlanner:
             for _ in range(_RETREAT_STEPS):
                 goal += _RETREAT_STEP * self._edge * np.array(direction)
                 retreated = self._tool.move_towards(retreated, goal, rotation, 3)
-                if self._space.free(retreated, block[None])[0]:
+                if self.space.free(retreated, block[None])[0]:
                     return np.asarray(retreated[0])
         return q
 
@@ -543,6 +540,9 @@ def _gaps(
 
 
 MAX_PLANS = 8  # maximum number of plans per episode
+MAX_FAILED = 2
+"""Number of plans of an episode at drawer, door or dial that may find no path: each takes seconds,
+and after two, none was seen to find one."""
 GAIN = 0.2
 """Fraction of the lateral error between tool and block that is corrected in a control step."""
 LEAD, LEAD_STEP, MAX_LEAD = 0.05, 0.004, 0.3
@@ -565,39 +565,38 @@ RISE = 0.003
 """Rise of the tool in a control step in which the arm collides with anything but the block [m]."""
 
 
-class ScriptedPush:
-    """Moves behind the block, pushes it along y, and plans again where that fails.
+class ScriptedController(ABC):
+    """Follows a planned path behind an object, moves the object in closed loop, and plans again.
 
-    ``PushPlanner`` plans from collision tests and kinematics alone. The push is closed-loop: the
-    tool moves along y with a constant rotation, follows the block along x, and rises where the arm
-    has no room. Environments of other tasks stand still.
+    Environments of other tasks stand still.
+
+    Attributes:
+        pushing: Whether the path of the plan is done, and the tool pushes, shape (n,), bool.
     """
 
     def __init__(self, seed: int) -> None:
         """Set up; plans depend on the seed, the robot, its starts and the state of the episode."""
         self._seed = seed
         self._specs: Sequence[EnvSpec] = ()
-        self._planners: dict[tuple[int, int], PushPlanner] = {}
+        self._planners: dict[tuple[int, int], Any] = {}
         self._task: TaskBatch | None = None
 
     def act(self, task: TaskBatch) -> torch.Tensor:
-        """Return a step along the path behind the block, or of the push; shape (n, L)."""
+        """Return a step along the path behind the object, or of the push; shape (n, L)."""
         if self._specs is not task.specs:
             self._specs, self._planners = task.specs, {}
         if self._task is not task:
             self._begin(task)
-        block = task.simulation.object_pose
-        tool = frame_positions(task.robot_tables.tool_chain, task.env_robot_index, task.q)
-        is_push = task.task_mask("push") & ~task.is_idle
-        self._active &= is_push
-        new = is_push & (task.episode_step == 0)
-        self._num_plans[new] = 0
-        failed = self._advance(task, block, tool) | (is_push & ~self._active)
-        for key, envs in envs_by_planner(task, new | (failed & (self._num_plans < MAX_PLANS))):
-            self._plan(task, key, envs, block)
-        self._height += torch.where(self._blocked(task), RISE, 0.0)
-        pushed = self._push(task, block, tool)
-        targets = torch.where(self.pushing[:, None], pushed, self._follower.waypoint)
+        ours = self._ours & ~task.is_idle
+        self._active &= ours
+        new = ours & (task.episode_step == 0)
+        self._num_plans[new], self._num_failed[new] = 0, 0
+        failed = self._advance(task) | (ours & ~self._active)
+        left = (self._num_plans < MAX_PLANS) & (self._num_failed < MAX_FAILED)
+        self.pushing &= ~new
+        for key, envs in envs_by_planner(task, new | (failed & left)):
+            self._plan(task, key, envs)
+        targets = torch.where(self.pushing[:, None], self._push(task), self._follower.waypoint)
         targets = torch.where(self._active[:, None], targets, task.targets)
         return encode_actions(fractions_towards(task, targets), task.action_kind)
 
@@ -605,18 +604,52 @@ class ScriptedPush:
         """Allocate the state of a batch: a row per environment, without plans."""
         self._task, self._follower = task, PathFollower(task)
         n, device = task.num_envs, task.device
+        # Environments with such an object; those with an active plan.
+        self._ours, self._active, self.pushing = torch.zeros(3, n, dtype=torch.bool, device=device)
+        # Plans in the episode, and those without a path; control steps since the end of the path,
+        # and since the object made progress.
+        self._num_plans, self._num_failed, self._settling, self._still = torch.zeros(
+            4, n, dtype=torch.int64, device=device
+        )
+
+    @abstractmethod
+    def _advance(self, task: TaskBatch) -> torch.Tensor:
+        """Go on along the plans; return where pushes failed, (n,), bool."""
+
+    @abstractmethod
+    def _plan(self, task: TaskBatch, key: tuple[int, int], envs: Sequence[int]) -> None:
+        """Make plans in environments of a robot and layout."""
+
+    @abstractmethod
+    def _push(self, task: TaskBatch) -> torch.Tensor:
+        """Return the targets of joints that push, shape (n, J)."""
+
+    def _follow_paths(self, task: TaskBatch) -> None:
+        """Switch to the next waypoints, and to pushing where joints have arrived at the last."""
+        at_end = self._active & ~self.pushing & self._follower.advance()
+        self._settling = torch.where(at_end, self._settling + 1, self._settling)
+        arrived = (task.q - task.targets).abs().amax(dim=1) < ARRIVED
+        self.pushing = self.pushing | (at_end & (arrived | (self._settling > SETTLE_STEPS)))
+
+
+class ScriptedPush(ScriptedController):
+    """Moves behind the block, pushes it along y, and plans again where that fails.
+
+    ``PushPlanner`` plans from collision tests and kinematics alone. The push is closed-loop: the
+    tool moves along y with a constant rotation, follows the block along x, and rises where the arm
+    has no room.
+    """
+
+    def _begin(self, task: TaskBatch) -> None:
+        super()._begin(task)
+        self._ours = task.task_mask("push")
+        n, device = task.num_envs, task.device
         starts = [task.specs[i].goals for i in task.env_robot_index.tolist()]
         edges = [
             start.block.size[0] if isinstance(start, PushStartSet) else 1.0 for start in starts
         ]
         self._edge = torch.tensor(edges, device=device)
-        # A plan is active; its path is done, and the tool pushes.
-        self._active, self.pushing = torch.zeros(2, n, dtype=torch.bool, device=device)
-        # Plans in the episode; control steps since the end of the path, since the block made
-        # progress, and in which the arm could not move on.
-        self._num_plans, self._settling, self._still, self._stuck = torch.zeros(
-            4, n, dtype=torch.int64, device=device
-        )
+        self._stuck = torch.zeros_like(self._still)  # steps in which the arm could not move on
         # The farthest y of the block; its x before the push; how far the commanded tool may lead;
         # height, offset and gap of the plan.
         self._best, self._begun, self._lead, self._height, self._offset, self._gap = torch.zeros(
@@ -624,11 +657,8 @@ class ScriptedPush:
         )
         self._rotation = torch.zeros(n, 3, 3, device=device)
 
-    def _plan(
-        self, task: TaskBatch, key: tuple[int, int], envs: Sequence[int], block: torch.Tensor
-    ) -> None:
-        """Make plans in environments of a robot and layout; block has poses of blocks, (n, 7)."""
-        robot, _ = key
+    def _plan(self, task: TaskBatch, key: tuple[int, int], envs: Sequence[int]) -> None:
+        robot, block = key[0], task.simulation.object_pose
         if key not in self._planners:
             rng = np.random.default_rng([self._seed, robot])
             scene = task.layouts.scene(envs[0])
@@ -657,12 +687,10 @@ class ScriptedPush:
             self._begun[env], self._best[env], self._lead[env] = *block[env, :2], LEAD
             self._settling[env], self._still[env], self._stuck[env] = 0, 0, 0
 
-    def _advance(self, task: TaskBatch, block: torch.Tensor, tool: torch.Tensor) -> torch.Tensor:
-        """Switch to the next waypoint or to the push; return where pushes failed, (n,), bool."""
-        at_end = self._active & ~self.pushing & self._follower.advance()
-        self._settling = torch.where(at_end, self._settling + 1, self._settling)
-        arrived = (task.q - task.targets).abs().amax(dim=1) < ARRIVED
-        self.pushing = self.pushing | (at_end & (arrived | (self._settling > SETTLE_STEPS)))
+    def _advance(self, task: TaskBatch) -> torch.Tensor:
+        block = task.simulation.object_pose
+        self._tool = tool = _tools(task, task.q)
+        self._follow_paths(task)
         progress = block[:, 1] > self._best + PROGRESS
         self._best = torch.where(progress, block[:, 1], self._best)
         self._still = torch.where(progress | ~self.pushing, 0, self._still + 1)
@@ -679,13 +707,15 @@ class ScriptedPush:
         blocked = torch.zeros_like(self._active)
         for key, envs in envs_by_planner(task, self._active & self.pushing):
             q = task.targets[envs, : task.specs[key[0]].robot.dof].double().cpu().numpy()
-            free = self._planners[key].free(q)
+            free = self._planners[key].space.free(q)
             blocked[envs] = ~torch.from_numpy(free).to(blocked.device)
         return blocked
 
-    def _push(self, task: TaskBatch, block: torch.Tensor, tool: torch.Tensor) -> torch.Tensor:
+    def _push(self, task: TaskBatch) -> torch.Tensor:
         """Return targets (n, J) with the tool farther along y, and nearer to the block along x."""
-        goal = frame_positions(task.robot_tables.tool_chain, task.env_robot_index, task.targets)
+        self._height += torch.where(self._blocked(task), RISE, 0.0)
+        block, tool, goal = task.simulation.object_pose, self._tool, _tools(task, task.targets)
+        tables, robots = task.robot_tables, task.env_robot_index
         lead = goal[:, 1] - tool[:, 1]
         stands = task.simulation.object_velocity[:, 1] < MOVING
         grow = self.pushing & stands & (lead > self._lead - SPEED)
@@ -695,24 +725,23 @@ class ScriptedPush:
         goal += torch.stack([dx.clamp(-SPEED, SPEED), dy, torch.zeros_like(dy)], dim=1)
         goal[:, 2] = self._height
         targets = pose_ik_step(
-            task.robot_tables.tool_chain,
-            task.env_robot_index,
+            tables.tool_chain,
+            robots,
             task.targets,
             goal,
             self._rotation,
-            (
-                task.robot_tables.lower[task.env_robot_index],
-                task.robot_tables.upper[task.env_robot_index],
-            ),
-            rotation_budget=task.robot_tables.max_step[task.env_robot_index],
+            (tables.lower[robots], tables.upper[robots]),
+            rotation_budget=tables.max_step[robots],
         )
-        short = (
-            goal[:, 1]
-            - frame_positions(task.robot_tables.tool_chain, task.env_robot_index, targets)[:, 1]
-        )
+        short = goal[:, 1] - _tools(task, targets)[:, 1]
         stuck = self.pushing & (dy > 0) & (short > 0.8 * SPEED)
         self._stuck = torch.where(stuck, self._stuck + 1, 0)
         return targets
+
+
+def _tools(task: TaskBatch, q: torch.Tensor) -> torch.Tensor:
+    """Return the positions of the tools (n, 3) at joint positions (n, J)."""
+    return frame_positions(task.robot_tables.tool_chain, task.env_robot_index, q)
 
 
 def envs_by_planner(

@@ -113,10 +113,6 @@ class RecordingConfig:
     """Whether cameras also have depths."""
     goals: GoalConfig = field(default_factory=GoalConfig)
 
-    def policy_for(self, task: str) -> str:
-        """Return the name of the policy at a task."""
-        return best_of(task, self.policy)
-
     def as_data(self, tasks: Sequence[str]) -> dict[str, Any]:
         """Return the entries of ``recording.json``; they contain no folder of this machine."""
         robots = []
@@ -129,7 +125,7 @@ class RecordingConfig:
             "format": FORMAT,
             "morphgen": version("morphgen"),
             "robots": robots,
-            "policy": {task: _named(self.policy_for(task)) for task in tasks},
+            "policy": {task: _named(best_of(task, self.policy)) for task in tasks},
             **{key: getattr(self, key) for key in _KEYS},
             "constants": self.goals.as_data(tasks),
         }
@@ -191,7 +187,9 @@ def record(folder: Path, config: RecordingConfig, *, jobs: int = 1, ray: str | N
     require_writable_folder(folder)
     tasks = tuple(dict.fromkeys(task for source in config.sources for task in tasks_of(source)))
     for task in tasks:
-        read_controller(config.policy_for(task), task)  # raises if the policy is not for the task
+        read_controller(
+            best_of(task, config.policy), task
+        )  # raises if the policy is not for the task
     settings = config.as_data(tasks)
     if (folder / INFO).is_file():
         begin_folder(folder / RECORDING, settings, "data set", TaskError)
@@ -382,7 +380,7 @@ def _record_task(
     spec: EnvSpec, config: RecordingConfig, robot: str
 ) -> Iterator[tuple[dict[str, Any], Arrays]]:
     """Yield the episodes of a robot at a task, each with the arrays of its steps."""
-    policy = config.policy_for(spec.task)
+    policy = best_of(spec.task, config.policy)
     controller_spec = read_controller(policy, spec.task)
     seeds = episode_seeds(config.seed, robot, spec.task, config.episodes)
     simulator = SIMULATORS[config.sim]

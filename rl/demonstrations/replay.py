@@ -56,8 +56,7 @@ def choose_episodes(demos: Demonstrations, count: int, seed: int) -> list[int]:
 
 def replay(demos: Demonstrations, episodes: Sequence[int]) -> Iterator[Replay]:
     """Simulate episodes again, and yield how far they are from the recorded ones."""
-    for index in episodes:
-        yield _replay(demos, demos.episodes[index])
+    return (_replay(demos, demos.episodes[index]) for index in episodes)
 
 
 @one_torch_thread()

@@ -47,7 +47,7 @@ from morphgen.splits.split_file import (
 from morphgen.tasks.goals.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot, member_spec
-from morphgen.tasks.task import EnvSpec, GoalSet
+from morphgen.tasks.task import EnvSpec
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -285,17 +285,15 @@ def _without_sides(source: GrammarSource | RecordedSource) -> TaskError:
     )
 
 
+_shipped = lru_cache(maxsize=2)(read_goals)
+
+
 @lru_cache(maxsize=64)
 def _of_member(member: Member, source: SplitSource, config: GoalConfig) -> EnvSpec:
     sets = _shipped(source.goal_dir, source.side) if source.goal_dir else None
     shipped = shipped_goal_set(sets, member.name, source.goal_dir)
     library = default_library(tuple(map(Path, source.library)))
     return member_spec(member, library, config, shipped=shipped)
-
-
-@lru_cache(maxsize=2)
-def _shipped(folder: str, side: Side) -> dict[str, GoalSet]:
-    return read_goals(folder, side)
 
 
 FILE = "robots.json"  # file in a run's folder that lists its drawn robots

@@ -311,7 +311,10 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
     def step(self, action: NDArray[Any]) -> EnvStep:
         """Act for one control step."""
         self._require_running()
-        action = self._checked(action)
+        action, expected = np.asarray(action), (len(self.action_links),)
+        if action.shape != expected:
+            joints = ", ".join(self.action_joints)
+            raise TaskError(f"the action has shape {action.shape}; expected {expected}: {joints}")
         step = self._torch_step if self._stepper is None else self._stepper.step
         observation, reward, terminated, truncated, info = step(action)
         self._running = not (terminated or truncated)
@@ -359,15 +362,6 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         """Free everything; a second call does nothing."""
         self.closed = True
         self._free()
-
-    def _checked(self, action: NDArray[Any]) -> NDArray[Any]:
-        """Return an action with a number for each of the task's joints."""
-        action = np.asarray(action)
-        expected = (len(self.action_links),)
-        if action.shape != expected:
-            joints = ", ".join(self.action_joints)
-            raise TaskError(f"the action has shape {action.shape}; expected {expected}: {joints}")
-        return action
 
     def _make_stepper(self) -> NumpyStepper | None:
         if not steps_in_numpy(self.batch):

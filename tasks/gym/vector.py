@@ -391,8 +391,10 @@ def task_vector(
     **options: Any,  # noqa: ANN401
 ) -> TaskVector:
     """Make a vector environment for ``gymnasium.make_vec("morphgen/Reach-v0", num_envs, ...)``."""
+    valid = {*signature(make_batch).parameters, *BatchOptions.__optional_keys__}
+    valid -= {"task", "num_envs", "options"}
     for name in options:
-        if name not in (valid := _batch_options()):
+        if name not in valid:
             raise TaskError(f"vector environments: unknown option {name!r}{nearest(name, valid)}")
     for name, kind in (("observe", ObservationConfig), ("contacts", Contacts)):
         if name in options:
@@ -413,12 +415,6 @@ def task_vector(
     except TaskError:
         batch.close()
         raise
-
-
-def _batch_options() -> set[str]:
-    """Return the names of the arguments of ``make_batch``."""
-    named = {each.name for each in signature(make_batch).parameters.values()}
-    return (named | set(BatchOptions.__optional_keys__)) - {"task", "num_envs", "options"}
 
 
 def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:

@@ -50,7 +50,7 @@ class ArticulatedObject:
             )
         if self.moving_inertial is None:
             raise SimulationError(f"object {self.body.name!r}: the link that moves has no mass")
-        if self._contact_link not in self._moving_links:
+        if self._contact_link not in {link.name for link in rigid_groups(self.body)[1].links}:
             raise SimulationError(
                 f"object {self.body.name!r}: the link {self._contact_link!r} of its frame "
                 f"{TOOL!r} does not move"
@@ -161,10 +161,6 @@ class ArticulatedObject:
     def _contact_link(self) -> str:
         """Link of the contact point."""
         return self.body.tool.link if self.body.tool else self.joint.child
-
-    @property
-    def _moving_links(self) -> set[str]:
-        return {link.name for link in rigid_groups(self.body)[1].links}
 
     @cached_property
     def moving_inertial(self) -> Inertial | None:

@@ -44,14 +44,10 @@ other simulators.
 """
 
 
-def _control_step_matrix() -> Array:
-    """Return ``CONTROL_STEP``: the matrix of a physics step to the power of ``SUBSTEPS``."""
-    keep, pull = 1 - 2 * BANDWIDTH * TIMESTEP, BANDWIDTH**2 * TIMESTEP
-    step = np.array([[1 - TIMESTEP * pull, -TIMESTEP * keep], [pull, keep]])
-    return np.linalg.matrix_power(step, SUBSTEPS)
-
-
-CONTROL_STEP = _control_step_matrix()
+_KEEP, _PULL = 1 - 2 * BANDWIDTH * TIMESTEP, BANDWIDTH**2 * TIMESTEP
+CONTROL_STEP = np.linalg.matrix_power(
+    np.array([[1 - TIMESTEP * _PULL, -TIMESTEP * _KEEP], [_PULL, _KEEP]]), SUBSTEPS
+)
 """Matrix A of a control step with a constant target: (error, velocity) at the end are A times those
 at the beginning, shape (2, 2).
 

@@ -97,7 +97,7 @@ def structures(scenes: Sequence[Scene], compiled: Sequence[World]) -> list[Struc
                 if not PAIRS.isdisjoint(names) and not _have_one_material(members[0], world):
                     continue
                 names -= PAIRS
-                if all(map(_is_batched, names)) and _same_indices(members[0], world):
+                if names <= _BATCHED and _same_indices(members[0], world):
                     members.append(world)
                     batched.update(dict.fromkeys(sorted(names)))
                     break
@@ -201,13 +201,9 @@ def _warp_model(world: World, scene: Scene) -> Model:
         ) from error
 
 
-def _is_batched(name: str) -> bool:
-    """Return whether a field of the model has numbers for every world."""
-    spec = _FIELDS[name]
-    return getattr(spec, "shape", ("",))[:1] == ("*",)
-
-
 _FIELDS: dict[str, Any] = {f.name: f.type for f in fields(Model) if f.name not in UNUSED}
+_BATCHED = {name for name, kind in _FIELDS.items() if getattr(kind, "shape", ())[:1] == ("*",)}
+"""Fields that have numbers for every world."""
 
 
 def _comparable(value: Any) -> object:  # noqa: ANN401  # fields of any type
