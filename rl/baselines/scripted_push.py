@@ -184,13 +184,17 @@ class PushPlanner:
         self._friction = starts.block.friction * starts.block.mass * GRAVITY
         self._stiffness = np.array([gain.stiffness for gain in actuation(self._robot)])
         self._idle = ~tables.moves_tool[robot, : self._robot.dof].cpu().numpy()
-        self.space = FreeSpace(scene)
+        self._space = FreeSpace(scene)
         step = tables.max_step[robot, : self._robot.dof].double().cpu().numpy()
-        self._planner = PathPlanner(self.space, step, int(rng.integers(2**63)))
+        self._planner = PathPlanner(self._space, step, int(rng.integers(2**63)))
         edge, first, last = self._edge, starts.blocks.min(axis=0), starts.blocks.max(axis=0)
         low = np.array([first[0] - edge, first[1] - 2.5 * edge, self._ground])
         high = np.array([last[0] + edge, self._line + edge, self._ground + 1.5 * edge])
-        self._bank, self._bank_tools = sample_tools_in_box(self.space, low, high, rng)
+        self._bank, self._bank_tools = sample_tools_in_box(self._space, low, high, rng)
+
+    def free(self, q: Array) -> NDArray[np.bool_]:
+        """Return whether configurations (n, dof) are free of collisions without the block, (n,)."""
+        return self._space.free(q)
 
     def plan(self, pushes: Sequence[Push]) -> list[Plan | None]:
         """Return the cheapest plan of each push.
@@ -355,12 +359,12 @@ class PushPlanner:
         q, error = solve_position_ik(self._robot, starts, goals)
         good = (np.abs(error[:, :2]) < _TOLERANCE * self._edge).all(axis=1)
         good &= np.abs(error[:, 2]) < self._edge / 2
-        good[good] = self.space.free(q[good], blocks[good])
+        good[good] = self._space.free(q[good], blocks[good])
         return q[good], np.flatnonzero(good)
 
     def _candidates(self, q: Array, blocks: Array) -> _Candidates:
         """Return those configurations behind their blocks (n, dof) that touch them along y."""
-        contacts = find_contacts(self.space, q, blocks, self._edge)
+        contacts = find_contacts(self._space, q, blocks, self._edge)
         position, rotation = self._tool.poses(contacts.q)
         _, J = frame_jacobian(self._robot, contacts.q)
         compliance = self._friction * (J[:, 1] ** 2 / self._stiffness).sum(axis=1)
@@ -388,7 +392,7 @@ class PushPlanner:
         good, finished = np.ones(len(q), dtype=np.bool_), np.zeros(len(q))
         centred = block.copy()
         centred[:, 0] += each.offset
-        over = overhang(self.space, q, centred, edge)
+        over = overhang(self._space, q, centred, edge)
         goal = each.position.copy()
         # In this order: plans, and the data sets of them, depend on the last bits.
         goal[:, 0] = block[:, 0] + (each.position[:, 0] - block[:, 0] - each.offset)
@@ -398,12 +402,12 @@ class PushPlanner:
             q = self._tool.move_towards(q, goal, each.rotation, 4)
             error = np.abs(self._tool.poses(q)[0][:, :2] - goal[:, :2]).max(axis=1)
             good &= error < _TOLERANCE * edge + 0.002
-            good[good] = self.space.free(q[good])
+            good[good] = self._space.free(q[good])
             moved = np.maximum(ahead - gap, 0)
             touching = np.flatnonzero(good & (ahead >= gap))
             shifts = moved[touching, None] + np.array([-_NEARER, _FARTHER]) * edge
             nearer, farther = touches(
-                self.space, q[touching], block[touching], np.zeros(1), shifts
+                self._space, q[touching], block[touching], np.zeros(1), shifts
             ).T
             good[touching] = nearer & ~farther
             finished[good] = i / _SIMULATED
@@ -411,7 +415,7 @@ class PushPlanner:
                 rows = np.flatnonzero(good & (over < MAX_OVERHANG))
                 ahead_of = block[rows]
                 ahead_of[:, 1] += moved[rows] + _FARTHER * edge
-                over[rows] = np.maximum(over[rows], overhang(self.space, q[rows], ahead_of, edge))
+                over[rows] = np.maximum(over[rows], overhang(self._space, q[rows], ahead_of, edge))
         begun = finished * length > gap + 0.1 * edge
         cost = _push_cost(each, finished, over)
         candidates.cost[chosen] = np.where(begun, cost, np.inf)
@@ -428,7 +432,7 @@ class PushPlanner:
 
     def _retreat(self, q: Array, block: Array) -> Array:
         """Return q if it is free of the block, else a free one near it, else q."""
-        if self.space.free(q[None], block[None])[0]:
+        if self._space.free(q[None], block[None])[0]:
             return q
         position, rotation = self._tool.poses(q[None])
         for direction in _RETREAT_DIRECTIONS:
@@ -436,7 +440,7 @@ class PushPlanner:
             for _ in range(_RETREAT_STEPS):
                 goal += _RETREAT_STEP * self._edge * np.array(direction)
                 retreated = self._tool.move_towards(retreated, goal, rotation, 3)
-                if self.space.free(retreated, block[None])[0]:
+                if self._space.free(retreated, block[None])[0]:
                     return np.asarray(retreated[0])
         return q
 
@@ -707,7 +711,7 @@ class ScriptedPush(ScriptedController):
         blocked = torch.zeros_like(self._active)
         for key, envs in envs_by_planner(task, self._active & self.pushing):
             q = task.targets[envs, : task.specs[key[0]].robot.dof].double().cpu().numpy()
-            free = self._planners[key].space.free(q)
+            free = self._planners[key].free(q)
             blocked[envs] = ~torch.from_numpy(free).to(blocked.device)
         return blocked
 
