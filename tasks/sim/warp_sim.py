@@ -221,11 +221,12 @@ def _comparable(value: Any) -> object:  # noqa: ANN401  # fields of any type
 
 def _same_indices(first: World, other: World) -> bool:
     """Return whether two worlds have joints, block and obstacles at the same indices."""
-    names = ("q_at", "qd_at", "movable_q_at", "movable_qd_at")
-    names += ("obstacles", "block_q_at", "object_q_at")
-    return all(
-        np.array_equal(getattr(first, name), getattr(other, name)) for name in names
-    ) and np.array_equal(dof_leaders(first)[0], dof_leaders(other)[0])
+    joints = ("q_at", "qd_at", "movable_q_at", "movable_qd_at")
+    is_same = all(
+        np.array_equal(getattr(first, name), getattr(other, name))
+        for name in (*joints, "obstacles", "block_q_at", "object_q_at")
+    )
+    return is_same and np.array_equal(dof_leaders(first)[0], dof_leaders(other)[0])
 
 
 def dof_leaders(world: World) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
