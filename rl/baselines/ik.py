@@ -133,16 +133,16 @@ def _solve_ik(
 
     The distance from a goal that is a pose is the larger one of position and rotation.
     """
-    tables, goals = task.robot_tables, reach_goals(task)
-    robots = task.env_robot_index[envs]
+    tables, robots = task.robot_tables, task.env_robot_index[envs]
+    positions, rotations, metres_per_radian = reach_goals(task)
     q, error = solve_ik(
         tables.tool_chain,
         robots,
         starts,
-        goals.positions[envs],
-        None if goals.rotations is None else goals.rotations[envs],
+        positions[envs],
+        None if rotations is None else rotations[envs],
         (tables.lower[robots], tables.upper[robots]),
-        rotation_weight=goals.metres_per_radian,
+        rotation_weight=metres_per_radian,
         iterations=ITERATIONS,
     )
     norms = torch.linalg.vector_norm(error.view(*error.shape[:2], -1, 3), dim=3)

@@ -6,8 +6,6 @@ each other; a policy that transfers to unseen robots must beat it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 
 from morphgen.model.kinematics_torch import frame_jacobian, pose_task
@@ -44,21 +42,15 @@ class Random:
         return actions.to(task.action_mask.device)
 
 
-@dataclass(frozen=True, eq=False)
-class ReachGoals:
-    """Goals of the n environments of a batch, in the root frames."""
+def reach_goals(task: TaskBatch) -> tuple[torch.Tensor, torch.Tensor | None, float]:
+    """Return the goals of a batch whose environments reach, in the root frames.
 
-    positions: torch.Tensor  # goal positions of the tools, shape (n, 3) [m]
-    rotations: torch.Tensor | None
-    """Goal rotations of the tools, shape (n, 3, 3); None for goals of positions."""
-    metres_per_radian: float  # see `ReachConfig.metres_per_radian`
-
-
-def reach_goals(task: TaskBatch) -> ReachGoals:
-    """Return the goals of a batch whose environments reach."""
+    They are positions (n, 3) [m], rotations (n, 3, 3) or None for goals of positions, and
+    ``ReachConfig.metres_per_radian``.
+    """
     config = next(spec.config for spec in task.specs if isinstance(spec.config, ReachConfig))
     rotations = task.groups.tool_targets(task.simulation.object_pose).rotations
-    return ReachGoals(task.field("goal")[:, :3], rotations, config.metres_per_radian)
+    return task.field("goal")[:, :3], rotations, config.metres_per_radian
 
 
 GAIN = 0.3
@@ -82,12 +74,11 @@ class JacobianColumns:
         """Return actions, shape (n, L)."""
         tables, robots = task.robot_tables, task.env_robot_index
         T_root_tool, J_root_tool = frame_jacobian(tables.tool_chain, robots, task.q)
-        goals = reach_goals(task)
-        if goals.rotations is None:
-            J, error = J_root_tool[:, :3], goals.positions - T_root_tool[:, :3, 3]
+        positions, rotations, weight = reach_goals(task)
+        if rotations is None:
+            J, error = J_root_tool[:, :3], positions - T_root_tool[:, :3, 3]
         else:
-            goal = goals.positions, goals.rotations, goals.metres_per_radian
-            J, error = pose_task(T_root_tool, J_root_tool, *goal)
+            J, error = pose_task(T_root_tool, J_root_tool, positions, rotations, weight)
         steps = column_steps(J, error)
         fractions = (GAIN * steps / tables.max_step[robots].clamp(min=1e-9)).clamp(-1, 1)
         return encode_actions(LinkJoints(tables, robots)(fractions), task.action_kind)

@@ -26,7 +26,7 @@ from morphgen.formats.bundle import split_colours
 from morphgen.formats.files import require_writable_file
 from morphgen.formats.mjcf.write import to_spec
 from morphgen.formats.picture import gl_context
-from morphgen.model.geometry import Pose
+from morphgen.model.geometry import Box, Pose, Shape
 from morphgen.model.inertia import bounding_box, box_corners
 from morphgen.model.kinematics import forward_kinematics, movable_positions
 from morphgen.model.robot import Robot
@@ -118,16 +118,11 @@ def _add_ground(spec: mujoco.MjSpec, height: float) -> None:
     )
 
 
-def _add_box(body: mujoco.MjsBody, edges: Vec3, rgba: Colour) -> mujoco.MjsGeom:
-    size = [edge / 2 for edge in edges]
-    return body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, rgba=rgba)
-
-
 def _add_marker(spec: mujoco.MjSpec, marker: Marker) -> mujoco.MjsBody:
     """Add a box, or axes inside a translucent ball."""
     body = spec.worldbody.add_body(mocap=True)
     if marker.shape == "box":
-        _add_box(body, marker.size, _BOX_MARKER)
+        add_shape(body, Shape(Box(marker.size))).rgba = _BOX_MARKER
         return body
     radius = marker.size[0] / 2
     for axis, rgba in zip(np.eye(3) * 2 * radius, _AXES, strict=True):
@@ -258,7 +253,7 @@ class Renderer:
         for obstacle in scene.obstacles:
             obstacles.append(spec.worldbody.add_body(mocap=True))
             obstacles[-1].pos, obstacles[-1].quat = obstacle.pose.position, obstacle.pose.quaternion
-            _add_box(obstacles[-1], obstacle.size, _OBSTACLE)
+            add_shape(obstacles[-1], Shape(Box(obstacle.size))).rgba = _OBSTACLE
         bodies = {}
         if scene.object is not None:
             bodies[BLOCK] = spec.worldbody.add_body(mocap=True)

@@ -275,16 +275,8 @@ class BulletScene:
         level = ground_contact_links(merged, self._scene.T_world_root)
         self._level = [link for name, link in links.items() if name in level]
         for name, link in links.items():
-            pybullet.changeDynamics(
-                self.robot,
-                link,
-                lateralFriction=FRICTION,
-                linearDamping=0,
-                angularDamping=0,
-                jointDamping=0,
-                **self._client,
-            )
-            self._assign(self.robot, link, _ROOT if name in root_links else _LINKS)
+            group = _ROOT if name in root_links else _LINKS
+            self._add(self.robot, FRICTION, group, link, jointDamping=0)
         if self._contacts.self_collision:
             for a, b in merged.ignore_pairs:
                 pybullet.setCollisionFilterPair(
@@ -351,16 +343,12 @@ class BulletScene:
         )
         return body
 
-    def _add(self, body: int, friction: float, group: int, link: int = -1) -> int:
-        """Set friction and collision group of a body's base, or of a link; return the body."""
-        pybullet.changeDynamics(
-            body, link, lateralFriction=friction, linearDamping=0, angularDamping=0, **self._client
-        )
-        self._assign(body, link, group)
-        return body
-
-    def _assign(self, body: int, link: int, group: int) -> None:
-        """Record a link's collision group and the groups it collides with, for ``reset``."""
+    def _add(
+        self, body: int, friction: float, group: int, link: int = -1, **dynamics: float
+    ) -> int:
+        """Set friction, damping and collisions of a body's base, or of a link; return the body."""
+        still = {"linearDamping": 0, "angularDamping": 0, **dynamics}
+        pybullet.changeDynamics(body, link, lateralFriction=friction, **still, **self._client)
         robot = _LINKS | _ROOT
         surroundings = _STATIC | _BLOCK | _ARTICULATED if self._contacts.scene else 0
         mask = {
@@ -370,7 +358,8 @@ class BulletScene:
             _STATIC: _BLOCK | (_LINKS if self._contacts.scene else 0),
             _BLOCK: _STATIC | (robot if self._contacts.scene else 0),
         }[group]
-        self._groups.append((body, link, group, mask))
+        self._groups.append((body, link, group, mask))  # for ``reset``
+        return body
 
     def reset(
         self,

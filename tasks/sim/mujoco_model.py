@@ -173,7 +173,8 @@ def _world(scene: Scene, robot: Robot, spec: mujoco.MjSpec) -> World:
     for obstacle in scene.obstacles:
         obstacles.append(spec.worldbody.add_body(mocap=True))
         obstacles[-1].pos, obstacles[-1].quat = obstacle.pose.position, obstacle.pose.quaternion
-        geom = _add_box(obstacles[-1], obstacle, _OBSTACLE_PRIORITY)
+        geom = add_shape(obstacles[-1], Shape(Box(obstacle.size)))
+        geom.priority, geom.friction[0] = _OBSTACLE_PRIORITY, obstacle.friction
         geom.contype, geom.conaffinity = _BY_SCENE | _BY_BLOCK, 0
     thing = scene.object if isinstance(scene.object, ArticulatedObject) else None
     if scene.block is not None:
@@ -211,7 +212,8 @@ def _add_block(spec: mujoco.MjSpec, block: Block) -> None:
     body.explicitinertial = True  # else MuJoCo computes them from the geom's density
     body.mass = block.mass
     body.inertia = [block.mass * total / 12 for total in (y + z, x + z, x + y)]
-    geom = _add_box(body, block, _BLOCK_PRIORITY)
+    geom = add_shape(body, Shape(Box(block.size)))
+    geom.priority, geom.friction[0] = _BLOCK_PRIORITY, block.friction
     geom.contype, geom.conaffinity = _BY_SCENE, _BY_BLOCK
     geom.solimp, geom.margin = BLOCK_IMPEDANCE, BLOCK_MARGIN
 
@@ -258,12 +260,4 @@ def add_shape(body: mujoco.MjsBody, shape: Shape) -> mujoco.MjsGeom:
         case Mesh():
             raise TypeError(f"{shape.geometry.path}: a mesh is no primitive shape")
     geom.pos, geom.quat = shape.T_link_shape.position, shape.T_link_shape.quaternion
-    return geom
-
-
-def _add_box(body: mujoco.MjsBody, block: Block, priority: int) -> mujoco.MjsGeom:
-    geom = body.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX, size=[edge / 2 for edge in block.size], priority=priority
-    )
-    geom.friction[0] = block.friction
     return geom

@@ -301,39 +301,23 @@ class Group:
         The control law sees the joint-space inertia and the Coriolis forces of the state that it
         acts on: MuJoCo computes them in the first half of a physics step.
         """
-        mujoco_warp.step1(self.model, self.data)
-        self._launch_control()
-        mujoco_warp.step2(self.model, self.data)
-        for _ in range(SUBSTEPS - 1):
-            mujoco_warp.step(self.model, self.data)
-        self.read()
-        self._find_diverged()
-
-    def _launch_control(self) -> None:
-        """Compute the controls of the actuators from the targets."""
-        data, targets = self.data, self._buffers["targets"]
-        dofs = self._acceleration.shape
+        data = self.data
+        mujoco_warp.step1(self.model, data)
+        state = [self._joints, self._buffers["targets"], data.qpos, data.qvel]
         wp.launch(
             kernels.accelerations,
-            dofs,
-            [self._joints, targets, data.qpos, data.qvel, self.model.dof_damping],
+            self._acceleration.shape,
+            [*state, self.model.dof_damping],
             [self._acceleration, data.qfrc_applied],
         )
         mujoco_warp.mul_m(self.model, data, self._force, self._acceleration)
-        wp.launch(
-            kernels.controls,
-            data.ctrl.shape,
-            [
-                self._joints,
-                targets,
-                data.qpos,
-                data.qvel,
-                self._force,
-                data.qfrc_bias,
-                data.qfrc_gravcomp,
-            ],
-            [data.ctrl],
-        )
+        forces = [self._force, data.qfrc_bias, data.qfrc_gravcomp]
+        wp.launch(kernels.controls, data.ctrl.shape, [*state, *forces], [data.ctrl])
+        mujoco_warp.step2(self.model, data)
+        for _ in range(SUBSTEPS - 1):
+            mujoco_warp.step(self.model, data)
+        self.read()
+        self._find_diverged()
 
     def read(self) -> None:
         """Write the state into the buffers."""
