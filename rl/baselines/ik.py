@@ -99,10 +99,22 @@ class InverseKinematics:
                 nodes = np.array(tree.nodes)
                 rows = torch.randint(len(nodes), (STARTS,), generator=self._generator)
                 starts[:, i, : nodes.shape[1]] = torch.from_numpy(nodes[rows.numpy()])
-        q, distance = _solve_ik(task, envs, starts)
+        tables, (positions, rotations, metres_per_radian) = task.robot_tables, reach_goals(task)
+        q, error = solve_ik(
+            tables.tool_chain,
+            robots,
+            starts,
+            positions[envs],
+            None if rotations is None else rotations[envs],
+            (tables.lower[robots], tables.upper[robots]),
+            rotation_weight=metres_per_radian,
+            iterations=ITERATIONS,
+        )
+        # From a goal that is a pose it is the larger one of position and rotation.
+        distance = torch.linalg.vector_norm(error.view(*error.shape[:2], -1, 3), dim=3).amax(dim=2)
         # A joint of two turns reaches a pose in two ways, of which one may outlast the episode.
-        q = task.robot_tables.nearest_turns(robots, q, now)
-        steps = ((q - now) / task.robot_tables.max_step[robots].clamp(min=1e-9)).abs().amax(dim=2)
+        q = tables.nearest_turns(robots, q, now)
+        steps = ((q - now) / tables.max_step[robots].clamp(min=1e-9)).abs().amax(dim=2)
         # Solutions come before all others, by control steps; others by their distance.
         order = torch.where(distance < CLOSE, steps, 1e9 * (1 + distance)).argsort(dim=0)
         count = (distance < CLOSE).sum(dim=0).clamp(min=1).tolist()
@@ -124,29 +136,6 @@ class InverseKinematics:
         if len(goals):
             return planner.plan_rrt(start, goals, attempt=attempt)
         return planner.plan_rrt(start, goals, attempt=attempt, iterations=TREE_ITERATIONS)
-
-
-def _solve_ik(
-    task: TaskBatch, envs: torch.Tensor, starts: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return configurations (S, n, J) and distances from the goals (S, n) [m] from starts.
-
-    The distance from a goal that is a pose is the larger one of position and rotation.
-    """
-    tables, robots = task.robot_tables, task.env_robot_index[envs]
-    positions, rotations, metres_per_radian = reach_goals(task)
-    q, error = solve_ik(
-        tables.tool_chain,
-        robots,
-        starts,
-        positions[envs],
-        None if rotations is None else rotations[envs],
-        (tables.lower[robots], tables.upper[robots]),
-        rotation_weight=metres_per_radian,
-        iterations=ITERATIONS,
-    )
-    norms = torch.linalg.vector_norm(error.view(*error.shape[:2], -1, 3), dim=3)
-    return q, norms.amax(dim=2)
 
 
 def random_starts(task: TaskBatch, envs: torch.Tensor, generator: torch.Generator) -> torch.Tensor:

@@ -91,13 +91,9 @@ def _add_surroundings(spec: mujoco.MjSpec, scene: Scene, extent: float) -> None:
         specular=[0.1, 0.1, 0.1],
         castshadow=True,
     )
-    if scene.ground is not None:
-        _add_ground(spec, scene.ground)
-
-
-def _add_ground(spec: mujoco.MjSpec, height: float) -> None:
-    """Add a plane with squares of 0.1 m in groups of five."""
-    spec.add_texture(
+    if scene.ground is None:
+        return
+    spec.add_texture(  # squares of 0.1 m in groups of five
         name="morphgen/squares",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
@@ -113,7 +109,7 @@ def _add_ground(spec: mujoco.MjSpec, height: float) -> None:
     spec.worldbody.add_geom(
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         size=[20, 20, _GROUND_SPACING],
-        pos=[0.0, 0.0, height],
+        pos=[0.0, 0.0, scene.ground],
         material="morphgen/ground",
     )
 

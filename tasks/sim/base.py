@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -318,19 +318,12 @@ class HostSimulation(Simulation):
         self._num_steps += 1
         faults = self._advance()
         if faults or self._faults:
-            self._report(faults)
+            self._faults, self._diverged = {}, self._diverged.new_zeros(len(self.scenes))
+            for env, reason in sorted(faults.items()):
+                steps = self._num_steps - self._reset_at[env]
+                self._faults[env] = f"{self._label(env)}: diverged in step {steps}: {reason}"
+                self._diverged[env] = True
         return self._diverged
-
-    def _report(self, faults: Mapping[int, str]) -> None:
-        """Keep the reasons for environments that diverged."""
-        import torch
-
-        self._faults = {}
-        self._diverged = torch.zeros(len(self.scenes), dtype=torch.bool)
-        for env, reason in sorted(faults.items()):
-            steps = self._num_steps - self._reset_at[env]
-            self._faults[env] = f"{self._label(env)}: diverged in step {steps}: {reason}"
-            self._diverged[env] = True
 
     def faults(self) -> dict[int, str]:
         """Return why environments diverged in the last step; see ``Simulation.faults``."""
