@@ -370,18 +370,16 @@ def _geometries(link: Link) -> dict[Geometry, None]:
     return dict.fromkeys(shape.geometry for shape in (*link.visuals, *link.collisions))
 
 
-def is_readable(geometry: Geometry) -> bool:
-    """Return whether a primitive has positive dimensions, or a mesh can be loaded."""
+def is_readable(geometry: Geometry, read: Callable[[Mesh], object] = mesh_triangles) -> bool:
+    """Return whether a primitive has positive dimensions, or a mesh can be read by a function."""
     if isinstance(geometry, Mesh):
-        return _is_scale_valid(geometry) and _mesh_fault(mesh_triangles, geometry) is None
+        return _is_scale_valid(geometry) and _mesh_fault(read, geometry) is None
     return all(math.isfinite(size) and size > 0 for size in dimensions(geometry))
 
 
 def has_hull(geometry: Geometry) -> bool:
     """Return whether a primitive has positive dimensions, or a mesh has a convex hull."""
-    if isinstance(geometry, Mesh):
-        return _is_scale_valid(geometry) and _mesh_fault(hull_triangles, geometry) is None
-    return is_readable(geometry)
+    return is_readable(geometry, hull_triangles)
 
 
 def _is_scale_valid(mesh: Mesh) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -45,10 +46,7 @@ def read_description(
 def read_installed(package: str, file: str, args: Mapping[str, str]) -> Robot:
     """Read a description of an installed data package, kept in the user's cache."""
     path, finder = resolve.distribution_file(package, file), resolve.default_finder()
-
-    def read() -> Robot:
-        return read_description(path, args, finder)
-
+    read = partial(read_description, path, args, finder)
     if not (resolve.is_installed(path) and resolve.finds_installed_only(finder)):
         return read()
     key = (path, finder.roots, dict(args))

@@ -237,9 +237,6 @@ def _ignored_in_part(part: Part) -> tuple[Pair, ...]:
     collisions = (shape.geometry for link in fragment.links for shape in link.collisions)
     key = (fragment, *(mesh_key(each) for each in collisions if isinstance(each, Mesh)))
 
-    def make() -> tuple[Pair, ...]:
-        return survey_collisions(fragment).ignore_pairs
-
     if None in key:
-        return make()
-    return kept("pairs", key, make)
+        return survey_collisions(fragment).ignore_pairs
+    return kept("pairs", key, lambda: survey_collisions(fragment).ignore_pairs)

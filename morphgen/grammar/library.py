@@ -71,9 +71,7 @@ class Library:
     def manifests(self, kind: PartKind | None = None) -> list[Manifest]:
         """Return the manifests of all sound parts, or of those of one kind, by kind and name."""
         of_kind = [manifest for manifest in self._sound() if kind in (None, manifest.kind)]
-        return sorted(
-            of_kind, key=lambda manifest: (PART_KINDS.index(manifest.kind), manifest.name)
-        )
+        return sorted(of_kind, key=lambda part: (PART_KINDS.index(part.kind), part.name))
 
     def faults(self) -> list[PartError]:
         """Return why parts cannot be read, by name."""

@@ -14,7 +14,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 from morphgen.errors import FormatError
@@ -139,9 +139,7 @@ def _compiled(
     path = path.absolute()
     given = dict(constants)
 
-    def read() -> tuple[Sequence[str], Sequence[str]] | None:
-        return trace(path, finder, given, example, installed_only=True)
-
+    read = partial(trace, path, finder, given, example, installed_only=True)
     try:
         if not is_installed(path):
             from morphgen.formats.xacro.expand import run_in_child
