@@ -82,13 +82,11 @@ def episodes_for(steps: int, longest: int) -> int:
     return -(-steps // longest)
 
 
-def evaluate_run(
-    path: Path, side: Side, config: EvalConfig, mode: Mode, *, device: str = "cpu"
-) -> list[Score]:
+def evaluate_run(path: Path, side: Side, config: EvalConfig, mode: Mode) -> list[Score]:
     """Evaluate a run on the robots of a side of its split, or on its one robot."""
     files = list(checkpoint_files(path))
     source = other_side(read_checkpoint(files[0])[0].source, side)
-    return evaluate_checkpoints(files, source, config, mode, device=device)
+    return evaluate_checkpoints(files, source, config, mode)
 
 
 def evaluate_checkpoints(

@@ -302,17 +302,15 @@ class FreeSpace:
             raise ValueError(f"q has shape {q.shape}; {robot.name} needs (n, {robot.dof})")
         if not np.isfinite(q).all():  # NaN collides with nothing, and would be free
             raise ValueError(f"q of {robot.name} is not finite")
-        slides = np.zeros((len(q), self._num_static))
-        return np.concatenate([q, slides, self._block_joints(blocks, len(q))], axis=1)
-
-    def _block_joints(self, blocks: ArrayLike | None, n: int) -> Array:
-        """Return the block's virtual joint positions, shape (n, 6), or (n, 0) without a block."""
-        if blocks is None:
-            return np.tile(_AWAY, (n, 1)) if self.scene.object else np.zeros((n, 0))
-        blocks = np.asarray(blocks, dtype=np.float64)
-        self._require_blocks(blocks, n)
-        rpy = np.array([_rpy(*rotation) for rotation in blocks[:, 3:].tolist()]).reshape(-1, 3)
-        return np.concatenate([blocks[:, :3], rpy[:, ::-1]], axis=1)
+        parts = [q, np.zeros((len(q), self._num_static))]
+        if blocks is not None:
+            blocks = np.asarray(blocks, dtype=np.float64)
+            self._require_blocks(blocks, len(q))
+            rpy = np.array([_rpy(*rotation) for rotation in blocks[:, 3:].tolist()]).reshape(-1, 3)
+            parts += [blocks[:, :3], rpy[:, ::-1]]
+        elif self.scene.object:
+            parts.append(np.tile(_AWAY, (len(q), 1)))
+        return np.concatenate(parts, axis=1)
 
     def _require_blocks(self, blocks: Array, n: int) -> None:
         """Require n finite poses of the block, and a block."""

@@ -40,8 +40,6 @@ from morphgen.tasks.sim.mujoco_model import add_shape
 from morphgen.tasks.task import EnvSpec, Marker
 from morphgen.typing import Array
 
-Colour = tuple[float, float, float, float]
-
 BLOCK = "block"  # name of the block among the mocap bodies
 _BLOCK, _OBSTACLE = (0.90, 0.55, 0.15, 1.0), (0.55, 0.25, 0.25, 1.0)
 _FRAME_MARKER, _BOX_MARKER = (0.10, 0.65, 0.25, 0.45), (0.10, 0.65, 0.25, 0.9)
