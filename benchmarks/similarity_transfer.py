@@ -48,7 +48,7 @@ from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.files import write_atomic
 from morphgen.grammar.library import Library, default_library
 from morphgen.rl.runs.robot_source import read_drawn
-from morphgen.splits.candidates import RobotFactory, members, recipe_of
+from morphgen.splits.candidates import RobotFactory, recipe_of
 from morphgen.splits.split import Member, Split
 from morphgen.splits.split_file import read_split
 from morphgen.typing import Array
@@ -93,7 +93,8 @@ def read_policies(args: argparse.Namespace, library: Library) -> Iterator[Policy
     """
     make = RobotFactory(library)
     recipes = [recipe_of((f"arm={arm}", "ee=stick"), library) for arm in REAL_ARMS]
-    arms = {arm.name: arm for arm in members(map(make, recipes), ("reach",), obstacles=False)}
+    made = map(make, recipes)
+    arms = {robot.name: robot.member("reach", ("reach",), obstacles=False) for robot in made}
     stored = read_scores(args.results)
     for variant, robots, seed in product(args.variants, args.robots, args.seeds):
         policy = policy_name(variant, robots, seed)

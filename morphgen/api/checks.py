@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from morphgen import checks
 from morphgen.arguments import checked_signature
 from morphgen.checks.conformance import ConformanceReport, compare, compare_file
-from morphgen.checks.hold import HoldRow, hold_files
+from morphgen.checks.hold import hold_files
 from morphgen.checks.rules import home_penetrations
 from morphgen.formats.bundle import CARD, bundle_folder, file_findings, read_bundle, write_bundle
 from morphgen.formats.gate import loader_copy
@@ -177,7 +177,11 @@ def _conform_bundle(bundle: Path, samples: int, seed: int) -> ConformanceReport:
     robot = read_bundle(bundle)
     with loader_copy(bundle) as folder:
         report = compare(robot, folder, samples, seed)
-        holds = (*hold_files(robot, folder), *_hold_in_environments(robot))
+        holds = hold_files(robot, folder)
+    if find_spec("torch") is not None:  # the simulators of the tasks are an extra
+        from morphgen.tasks.hold_home import hold_in_environment
+
+        holds += tuple(hold_in_environment(robot, name) for name in ("mujoco", "pybullet"))
     return replace(
         report,
         passed=report.passed and all(row.passed is not False for row in holds),
@@ -186,12 +190,3 @@ def _conform_bundle(bundle: Path, samples: int, seed: int) -> ConformanceReport:
             ", ".join(pair): depth for pair, depth in sorted(home_penetrations(robot).items())
         },
     )
-
-
-def _hold_in_environments(robot: Robot) -> tuple[HoldRow, ...]:
-    """Hold a robot in the simulators of the tasks, which are an extra."""
-    if find_spec("torch") is None:
-        return ()
-    from morphgen.tasks.hold_home import hold_in_environment
-
-    return tuple(hold_in_environment(robot, name) for name in ("mujoco", "pybullet"))

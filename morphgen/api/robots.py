@@ -237,14 +237,8 @@ def fit(
 
     options = FitOptions(max_primitives, iou, enclose, seed, spheres, cover)
     parts = default_library(library)
-    # A mesh is no description of a robot.
-    target = _mesh_robot(robot) or resolve_robot(robot, parts)
+    if isinstance(robot, str | PathLike) and Path(robot).suffix.lower() in MESH_SUFFIXES:
+        path = Path(robot)
+        robot = Robot(path.stem, (Link(path.stem, collisions=(Shape(Mesh(path)),)),), ())
+    target = resolve_robot(robot, parts)
     return fit_robot(target, options, parts.folders, visual=visual, jobs=jobs)
-
-
-def _mesh_robot(source: RobotLike) -> Robot | None:
-    """Return a robot of one link for a mesh file; None for anything else."""
-    if not isinstance(source, str | PathLike) or Path(source).suffix.lower() not in MESH_SUFFIXES:
-        return None
-    path = Path(source)
-    return Robot(path.stem, (Link(path.stem, collisions=(Shape(Mesh(path)),)),), ())

@@ -28,7 +28,6 @@ from morphgen.splits.candidates import (
     DerivedRecipe,
     RobotFactory,
     SampledRecipe,
-    members,
     numbered_name,
 )
 from morphgen.splits.split import COMPOSED, MAX_LINKS_KEY, Member, Regime, Split
@@ -181,20 +180,20 @@ def _drawn_splits(
         test.append(robot)
         report(len(train) + len(test), None)
     seeds = {stream.prefix: stream.seed for stream in (*train_streams, *test_streams)}
-    return assemble_drawn(request, regime, summary, train, test, {**provenance, "seeds": seeds})
+    sides = (members(request, side) for side in (train, test))
+    return assemble(request, regime, summary, *sides, {**provenance, "seeds": seeds})
 
 
 def assemble(
     request: SplitRequest,
     regime: Regime,
     summary: str,
-    train: Sequence[Member],
-    test: Sequence[Member],
+    train: Sequence[Sequence[Member]],
+    test: Sequence[Sequence[Member]],
     provenance: Mapping[str, object],
-    per_robot: int = 1,
 ) -> tuple[Split, ...]:
-    """Return the requested splits, one for each size."""
-    sizes = request.train or (len(train) // per_robot,)
+    """Return the requested splits, one for each size, from the members of every robot."""
+    sizes = request.train or (len(train),)
     nested = {"nested": list(sizes)} if len(sizes) > 1 else {}
     links = {} if request.max_links == MAX_LINKS else {MAX_LINKS_KEY: request.max_links}
     return tuple(
@@ -202,8 +201,8 @@ def assemble(
             f"{request.name}-train{n}" if nested else request.name,
             regime,
             summary.format(n=n),
-            tuple(train[: n * per_robot]),
-            tuple(test),
+            tuple(itertools.chain(*train[:n])),
+            tuple(itertools.chain(*test)),
             {
                 "seed": request.seed,
                 "train": n,
@@ -217,17 +216,10 @@ def assemble(
     )
 
 
-def assemble_drawn(
-    request: SplitRequest,
-    regime: Regime,
-    summary: str,
-    train: Sequence[Candidate],
-    test: Sequence[Candidate],
-    provenance: Mapping[str, object],
-) -> tuple[Split, ...]:
-    """Return the requested splits with a member for each robot and task; see ``assemble``."""
-    first, second = (members(side, request.tasks, request.obstacles) for side in (train, test))
-    return assemble(request, regime, summary, first, second, provenance, len(request.tasks))
+def members(request: SplitRequest, robots: Iterable[Candidate]) -> list[list[Member]]:
+    """Return the members of every robot: one for each task of a request."""
+    tasks, obstacles = request.tasks, request.obstacles
+    return [[robot.member(task, tasks, obstacles) for task in tasks] for robot in robots]
 
 
 def interpolation(
@@ -304,7 +296,7 @@ def composition(
                 "--from, or name another --seed"
             )
     first, second = (
-        [robot_of[each.name].member(each.task, request.tasks, request.obstacles) for each in side]
+        [[robot_of[each.name].member(each.task, request.tasks, request.obstacles)] for each in side]
         for side in (train, test)
     )
     kinds = len({candidate.combination for candidate in candidates})

@@ -23,7 +23,8 @@ from morphgen.benchmark.generate import (
     MAX_DRAWS,
     RobotStream,
     SplitRequest,
-    assemble_drawn,
+    assemble,
+    members,
     require_size,
 )
 from morphgen.benchmark.regimes import NOTHING, PatternRobot, found, parts, pattern_robots
@@ -708,11 +709,6 @@ def hold_out(
         provenance["seeds"] = {stream.prefix: stream.seed for stream in streams}
     if search.rejected:
         provenance["left_out"] = dict(sorted(Counter(search.rejected.values()).items()))
-    return assemble_drawn(
-        request,
-        HOLD_OUT,
-        f"{{n}} robots without {' or '.join(map(str, rules))}; test: {request.test} with it",
-        named[: len(train)],
-        named[len(train) :],
-        provenance,
-    )
+    summary = f"{{n}} robots without {' or '.join(map(str, rules))}; test: {request.test} with it"
+    sides = (members(request, side) for side in (named[: len(train)], named[len(train) :]))
+    return assemble(request, HOLD_OUT, summary, *sides, provenance)

@@ -141,13 +141,6 @@ def _is_date(text: str) -> bool:
         return False
 
 
-def release_text(release: Release) -> str:
-    """Return the text of ``release.json``."""
-    data = msgspec.to_builtins(release)
-    kept = {key: value for key, value in data.items() if value not in (None, "", (), [])}
-    return json.dumps({"format": release.format, **kept}, indent=2) + "\n"
-
-
 def is_release(folder: Path) -> bool:
     """Return whether a folder is a release."""
     return (folder / RELEASE_FILE).is_file()
@@ -356,17 +349,7 @@ class ReleaseReport:
     content: str
     """SHA-256 of ``SHA256SUMS``: the same for the same files, however they are compressed."""
     files: int  # number of files in the archive
-    size: int  # size of the archive [bytes]
-    release: Release
-
-
-@dataclass(frozen=True, eq=False)
-class CheckedRelease:
-    """A split that may be released as requested, with what the checks found out."""
-
-    release: Release
-    parts: tuple[licences.LicencedPart, ...]
-    survey: surveys.SplitSurvey
+    bytes: int  # size of the archive
 
 
 def require_releasable(
@@ -376,19 +359,26 @@ def require_releasable(
     parts = licences.licenced_parts(split, library)
     licences.require_allowed(split, parts, request.allowed_licences)
     _release(split, request, {})
-    return tuple(parts)
+    return parts
 
 
 def check_release(
     split: Split, library: Library, request: ReleaseRequest, *, jobs: int = 1
-) -> CheckedRelease:
-    """Require that a split may be released: names, licences of its parts, and audit."""
+) -> tuple[Release, tuple[licences.LicencedPart, ...], surveys.SplitSurvey]:
+    """Require that a split may be released: names, licences of its parts, and audit.
+
+    Return the description of the release, the parts of the robots, and their survey.
+    """
     parts = require_releasable(split, library, request)
     survey = surveys.survey_split(split, library, pairs="train", jobs=jobs)
     audited = audit_survey(survey, library)
-    require_passed(audited)
-    release = _release(split, request, _difficulty_data(survey, audited))
-    return CheckedRelease(release, parts, survey)
+    if not audited.passed():
+        first = next(each for each in audited.findings if each.severity == "error")
+        raise BenchmarkError(
+            f"{split.name} fails its audit: {first.code} at {first.where}: {first.why}; see "
+            "morphgen split audit"
+        )
+    return _release(split, request, _difficulty_data(survey, audited)), parts, survey
 
 
 def archive_path(out: Path, split: Split, release_version: str) -> Path:
@@ -407,9 +397,8 @@ def release_split(
     jobs: int = 1,
 ) -> ReleaseReport:
     """Write the archive of a release into a folder."""
-    checked = check_release(split, library, request, jobs=jobs)
-    release, parts = checked.release, checked.parts
-    rows = surveys.survey_difficulty(checked.survey, results)
+    release, parts, survey = check_release(split, library, request, jobs=jobs)
+    rows = surveys.survey_difficulty(survey, results)
     goals: list[GoalResult] = []
     if request.goals:
         goals = sample_split_goals(split, library, request.protocol.goals, jobs=jobs)
@@ -425,8 +414,10 @@ def release_split(
             request.protocol.goals,
             jobs=jobs,
         )
+        data = msgspec.to_builtins(release)
+        data = {key: value for key, value in data.items() if value not in ("", [], ())}
         texts = {
-            RELEASE_FILE: release_text(release),
+            RELEASE_FILE: json.dumps({"format": release.format, **data}, indent=2) + "\n",
             **licences.licence_files(parts),
             DIFFICULTY_FILE: surveys.difficulty_csv(rows, tuple(results or ())),
         }
@@ -438,16 +429,6 @@ def release_split(
         croissant = croissant_text(split, release, parts, sums)
         _add_files(report.folder, {licences.CROISSANT_FILE: croissant.encode()})
         return _write_archive(report.folder, out, release)
-
-
-def require_passed(result: Audit) -> None:
-    """Require that a split has passed its audit."""
-    if not result.passed():
-        first = next(each for each in result.findings if each.severity == "error")
-        raise BenchmarkError(
-            f"{result.split} fails its audit: {first.code} at {first.where}: {first.why}; see "
-            "morphgen split audit"
-        )
 
 
 def _release(split: Split, request: ReleaseRequest, difficulty: Mapping[str, Any]) -> Release:
@@ -501,7 +482,7 @@ def _write_archive(folder: Path, out: Path, release: Release) -> ReleaseReport:
     with writing(archive):
         made.replace(archive)
     content = file_sha256(folder / SUMS_FILE)
-    return ReleaseReport(archive, digest, content, len(files), archive.stat().st_size, release)
+    return ReleaseReport(archive, digest, content, len(files), archive.stat().st_size)
 
 
 _MAX_SHOWN = 100  # largest number of characters of a cell in a message

@@ -54,7 +54,9 @@ def fit(args: argparse.Namespace) -> None:
         raise MorphgenError("name a part, a robot or a mesh file, or say --all")
     options = FitOptions(**opt.given(args, (each.name for each in fields(FitOptions))))
     if args.all:
-        _fit_all_parts(args)
+        parts = parts_with_meshes(opt.library_of(args), missing=args.missing)
+        for path in track(store_parts(parts, jobs=args.jobs), args, "fitting", "part", len(parts)):
+            print_line(str(path))
         return
     if len(args.words) == 1 and Path(args.words[0]).suffix.lower() in MESH_SUFFIXES:
         _fit_mesh(args, options)
@@ -159,12 +161,6 @@ def _fit_robot(
         "agreement": of_primitives.as_dict(),
         "agreement_of_hulls": of_hulls.as_dict(),
     }
-
-
-def _fit_all_parts(args: argparse.Namespace) -> None:
-    parts = parts_with_meshes(opt.library_of(args), missing=args.missing)
-    for path in track(store_parts(parts, jobs=args.jobs), args, "fitting", "part", len(parts)):
-        print_line(str(path))
 
 
 def _report_text(report: FitReport) -> str:

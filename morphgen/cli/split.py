@@ -429,21 +429,13 @@ def release(args: argparse.Namespace) -> None:
         report = releases.release_split(
             split, args.out, library, request, extra=extra, results=results, jobs=args.jobs
         )
-    data = {
-        "archive": str(report.archive),
-        "sha256": report.sha256,
-        "content": report.content,
-        "files": report.files,
-        "bytes": report.size,
-        "notes": notes,
-    }
     lines = [
-        f"{report.archive}: {report.files} files, {report.size / 1e6:.2f} MB",
+        f"{report.archive}: {report.files} files, {report.bytes / 1e6:.2f} MB",
         f"  sha256: {report.sha256}",
         f"  content: {report.content}",
+        f"verify it anywhere: morphgen split verify {report.archive}",
     ]
-    lines.append(f"verify it anywhere: morphgen split verify {report.archive}")
-    opt.print_result(args, data, lambda: "\n".join(lines))
+    opt.print_result(args, {**vars(report), "notes": notes}, lambda: "\n".join(lines))
 
 
 def _notes(args: argparse.Namespace, split: Split, extra: Mapping[str, bytes]) -> list[str]:
@@ -472,7 +464,12 @@ def score(args: argparse.Namespace) -> int:
     """Score submissions, run episodes again if asked to, and print the ranking."""
     submissions = [read_submission(path) for path in args.submissions]
     library = opt.library_of(args)
-    name = args.split or _shipped_split(submissions[0].split.name, args.submissions[0])
+    name = args.split or submissions[0].split.name
+    if args.split is None and name not in split_names():  # a submission cannot name other files
+        raise BenchmarkError(
+            f"{args.submissions[0]}: split.name: {name} is not a split that comes with morphgen; "
+            "name its release or file with --split"
+        )
     with ExitStack() as stack:
         split, protocol, references, version = _open(name, stack)
     with bar(args, "composing robots"):
@@ -563,16 +560,6 @@ def _smallest_text(values: Mapping[str, Any]) -> str:
         f"smallest difference of {values['task']} (ZS) that shows with {POWER:.0%} power: "
         f"{values['success']:.1%} of success around 50% in {values['episodes']} episodes{score}"
     )
-
-
-def _shipped_split(name: str, where: Path) -> str:
-    """Return the name of a split that comes with morphgen; a submission cannot name other files."""
-    if name not in split_names():
-        raise BenchmarkError(
-            f"{where}: split.name: {name} is not a split that comes with morphgen; name its "
-            "release or file with --split"
-        )
-    return name
 
 
 def _open(name: str, stack: ExitStack) -> tuple[Split, EvalProtocol, References, str]:

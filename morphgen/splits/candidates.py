@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from morphgen.checks import check
@@ -140,10 +140,3 @@ class RobotFactory:
 def numbered_name(prefix: str, number: int) -> str:
     """Return the name of a sampled robot, such as ``arm3-000004``."""
     return f"{prefix}-{number:06d}"
-
-
-def members(
-    candidates: Iterable[Candidate], tasks: Sequence[str], obstacles: bool
-) -> tuple[Member, ...]:
-    """Return a member for each robot and task."""
-    return tuple(robot.member(task, tasks, obstacles) for robot in candidates for task in tasks)

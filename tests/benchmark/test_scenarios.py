@@ -21,7 +21,7 @@ from morphgen.errors import BenchmarkError
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import pin
-from morphgen.splits.candidates import RobotFactory, SampledRecipe, members, recipe_of
+from morphgen.splits.candidates import RobotFactory, SampledRecipe, recipe_of
 from morphgen.splits.split import SIDES
 from morphgen.splits.split_file import find_split, read_split, split_names, split_text
 
@@ -72,7 +72,7 @@ def generated(split, side):
                 pinned = pin(loaded, row.get("pinned", "").split(), LIBRARY)
                 assert row["seed"] == stream_seed(0, member.name.removesuffix(f"-{number:06d}"))
                 recipe = SampledRecipe(pinned, number, row["seed"], member.name)
-            yield from members([factory(recipe)], [member.task], member.obstacles)
+            yield factory(recipe).member(member.task, [member.task], member.obstacles)
     assert next(stored, None) is None
 
 
