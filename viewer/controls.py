@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -156,53 +155,41 @@ Robots = list[tuple[str, str]]  # names and URIs
 RobotLists = Mapping[str, Callable[[], Robots]]  # functions that list robots, by source
 
 
-@dataclass(eq=False)
 class RobotPicker:
-    """Controls that pick a robot in one browser."""
+    """Controls that pick a robot: from a list to search, or by words of the command."""
 
-    lists: RobotLists
-    current: Callable[[], str]  # returns the URI of the robot that the dropdown shows first
-    source: viser.GuiDropdownHandle[str]
-    robot: viser.GuiDropdownHandle[str]  # robots of the source; typing searches them
-    words: viser.GuiTextHandle
-    uris: dict[str, str]  # URIs of the robots in the dropdown, by label
+    def __init__(self, session: Session, lists: RobotLists, current: Callable[[], str]) -> None:
+        """Add the controls; ``current`` returns the URI of the robot that is shown first."""
+        gui, self._lists, self._current = session.client.gui, lists, current
+        self._source = gui.add_dropdown("from", tuple(lists))
+        self.robot = gui.add_dropdown("robot", ("",), hint="type to search")
+        hint = "such as arm=ur5 ee=plane, or the folder of a bundle"
+        self._words = gui.add_text("or words", "", hint=hint)
+        self._uris: dict[str, str] = {}  # URIs of the robots in the dropdown, by label
+        session.on_change(self._source, self._list_robots)
+        self._list_robots()
 
+    def _list_robots(self) -> None:
+        """Fill the dropdown of robots from the chosen source, each with a label of its own."""
+        current, robots = self._current(), self._lists[self._source.value]()[:MAX_CHOICES]
+        if current and current not in (uri for _, uri in robots):
+            robots = [(current, current), *robots]
+        self._uris = {}
+        for name, uri in robots:
+            while name in self._uris:
+                name += "'"
+            self._uris[name] = uri
+        self.robot.options = tuple(self._uris)
+        if current:
+            set_value(self.robot, next(name for name, uri in self._uris.items() if uri == current))
 
-def add_picker(session: Session, lists: RobotLists, current: Callable[[], str]) -> RobotPicker:
-    """Add controls that pick a robot: from a list to search, or by words of the command."""
-    gui = session.client.gui
-    source = gui.add_dropdown("from", tuple(lists))
-    robot = gui.add_dropdown("robot", ("",), hint="type to search")
-    words = gui.add_text("or words", "", hint="such as arm=ur5 ee=plane, or the folder of a bundle")
-    picker = RobotPicker(lists, current, source, robot, words, {})
-    session.on_change(source, lambda: _list_robots(picker))
-    _list_robots(picker)
-    return picker
-
-
-def _list_robots(picker: RobotPicker) -> None:
-    """Fill the dropdown of robots from the chosen source, each with a label of its own."""
-    current = picker.current()
-    robots = picker.lists[picker.source.value]()[:MAX_CHOICES]
-    if current and current not in (uri for _, uri in robots):
-        robots = [(current, current), *robots]
-    picker.uris = {}
-    for name, uri in robots:
-        while name in picker.uris:
-            name += "'"
-        picker.uris[name] = uri
-    picker.robot.options = tuple(picker.uris)
-    if current:
-        set_value(picker.robot, next(name for name, uri in picker.uris.items() if uri == current))
-
-
-def picked_uri(picker: RobotPicker) -> str:
-    """Return the URI of the robot that the user named or picked, and clear the words."""
-    text = picker.words.value.strip()
-    if not text:
-        return picker.uris[picker.robot.value]
-    set_value(picker.words, "")
-    return WORDS + text if "=" in text and ":" not in text else text
+    def picked_uri(self) -> str:
+        """Return the URI of the robot that the user named or picked, and clear the words."""
+        text = self._words.value.strip()
+        if not text:
+            return self._uris[self.robot.value]
+        set_value(self._words, "")
+        return WORDS + text if "=" in text and ":" not in text else text
 
 
 def robot_lists(uri: str, files: FileAccess, first: RobotLists) -> RobotLists:

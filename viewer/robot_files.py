@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from PIL import Image
@@ -99,18 +100,18 @@ def _read_files(folder: Path) -> dict[str, bytes]:
 def _draw_thumbnail(uri: str, files: FileAccess) -> Thumbnail:
     robot = read_robot_uri(uri, files)
     findings = {finding.code for finding in check(robot) if finding.severity != "info"}
-    stats = robot_stats(robot)
-    facts: dict[str, object] = {
-        "dof": stats.dof,
-        "links": stats.links,
-        "reach": stats.reach if robot.tool and stats.dof else None,
-        "mass": stats.mass,
-        "findings": tuple(sorted(findings)),
-    }
+    facts = robot_facts(robot) | {"findings": tuple(sorted(findings))}
     with tempfile.TemporaryDirectory() as folder:
         bundle = write_bundle(robot, Path(folder) / "robot", picture=False)
         picture = render(robot, bundle / MJCF, size=(2 * SIZE[0], 2 * SIZE[1]))
     return Thumbnail(_data_url(picture), facts)
+
+
+def robot_facts(robot: Robot) -> dict[str, object]:
+    """Return the numbers that rows of galleries have of a robot; no reach without a tool."""
+    stats = robot_stats(robot)
+    reach = stats.reach if robot.tool and stats.dof else None
+    return {"dof": stats.dof, "links": stats.links, "reach": reach, "mass": stats.mass}
 
 
 def _data_url(picture: Image.Image) -> str:
@@ -146,21 +147,17 @@ def change_tray(session: Session, action: str, uri: str) -> None:
 
 def send_bundles(session: Session, uris: Sequence[str]) -> None:
     """Send a zip with the bundles of robots, each in a folder of its name."""
-    futures = [session.workers.submit(bundle_files, uri, session.files) for uri in uris]
     files: dict[str, bytes] = {}
     size = 0
-    for i, (uri, future) in enumerate(zip(uris, futures, strict=True)):
-        session.set_status(f"packing {len(uris)} robots", i / len(uris))
-        bundle = session.workers.result(future)
-        name = _NOT_IN_NAMES.sub("-", uri_name(uri))[:MAX_NAME]
-        files |= {f"{i:04d}-{name}/{path}": data for path, data in bundle.items()}
-        size += sum(map(len, bundle.values()))
-        if size > MAX_EXPORT:
-            for waiting in futures:
-                waiting.cancel()
-            raise UriError(
-                f"the first {i + 1} of {len(uris)} robots have {size / 2**20:.0f} MB; at most "
-                f"{MAX_EXPORT // 2**20} MB are exported: select fewer, or copy their folders"
-            )
+    with session.activity("packing {} robots"):
+        bundles = session.workers.map(partial(bundle_files, files=session.files), uris)
+        for i, (uri, bundle) in enumerate(zip(uris, bundles, strict=True)):
+            name = _NOT_IN_NAMES.sub("-", uri_name(uri))[:MAX_NAME]
+            files |= {f"{i:04d}-{name}/{path}": data for path, data in bundle.items()}
+            size += sum(map(len, bundle.values()))
+            if size > MAX_EXPORT:
+                raise UriError(
+                    f"the first {i + 1} of {len(uris)} robots have {size / 2**20:.0f} MB; at most "
+                    f"{MAX_EXPORT // 2**20} MB are exported: select fewer, or copy their folders"
+                )
     session.send_file("robots.zip", zip_files("robots", files))
-    session.set_status("")

@@ -60,6 +60,11 @@ class Row:
     findings: tuple[str, ...] | None = None  # errors and warnings; sets have all
     order: int = 0
 
+    def completed(self, facts: Mapping[str, Any]) -> Row:
+        """Return the row with the facts that it lacks, and with findings of the robot itself."""
+        missing = {k: v for k, v in facts.items() if k == "findings" or getattr(self, k) is None}
+        return replace(self, **missing)
+
 
 FILTERS = ("search", "category", "role", "licence", "findings", *NUMBERS)
 """Keys of conditions on rows, as addresses have them: words that must all occur, a category, a

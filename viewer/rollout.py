@@ -6,10 +6,10 @@ import itertools
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import CancelledError, Future
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -33,13 +33,14 @@ class RolloutConfig:
     simulator: str = "mujoco"
 
 
+@dataclass(eq=False)
 class EpisodeSource:
     """Source of an episode: a file, whose episode is complete, or a simulation."""
 
-    def __init__(self, episode: Episode, max_steps: int) -> None:
-        """Take over an episode with its longest possible duration [control steps]."""
-        self.episode, self.max_steps = episode, max_steps
-        self.faults: dict[str, str] = {}  # errors of robots that cannot do the task, by URI
+    episode: Episode
+    max_steps: int  # longest possible duration [control steps]
+    faults: Mapping[str, str] = field(default_factory=dict)
+    """Errors of robots that cannot do the task, by URI."""
 
     def advance(self) -> bool:
         """Simulate one more control step; return False if the episode has ended."""
@@ -61,8 +62,7 @@ class RemoteRollout(EpisodeSource):
         """Start an episode."""
         self._process, self._key = process, secrets.token_hex(8)
         source = process.call(simulation("start"), self._key, config, files)
-        super().__init__(source.episode, source.max_steps)
-        self.faults = source.faults
+        super().__init__(source.episode, source.max_steps, source.faults)
         self._next: Future[Any] | None = process.submit(simulation("advance"), self._key)
 
     def advance(self) -> bool:

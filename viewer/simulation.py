@@ -87,8 +87,7 @@ class Rollout(EpisodeSource):
             [robot.track for robot in self._robots],
         )
         max_steps = max(int(robot.env.batch.max_episode_steps[0]) for robot in self._robots)
-        super().__init__(episode, max_steps)
-        self.faults |= {uri: str(error) for uri, error in faults.items()}
+        super().__init__(episode, max_steps, {uri: str(error) for uri, error in faults.items()})
 
     def advance(self) -> bool:
         """Simulate one control step of every running robot; return False if none is running."""
@@ -272,9 +271,7 @@ _rollouts: dict[str, Rollout] = {}  # those that run in this process, by key
 def start(key: str, config: RolloutConfig, files: FileAccess) -> EpisodeSource:
     """Start a rollout; return its robots at their start."""
     rollout = _rollouts[key] = Rollout(config, files)
-    source = EpisodeSource(rollout.episode, rollout.max_steps)
-    source.faults = rollout.faults
-    return source
+    return EpisodeSource(rollout.episode, rollout.max_steps, rollout.faults)
 
 
 def advance(key: str) -> tuple[bool, list[tuple[dict[str, Any], str]]]:

@@ -26,7 +26,6 @@ from morphgen.errors import BenchmarkError
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
-from morphgen.progress import report
 from morphgen.splits.split import (
     COMPOSED,
     HOLD_OUT,
@@ -70,8 +69,9 @@ class SplitStudy:
     matrices: Mapping[str, Array]  # similarity of their pairs by measure, shape (n, n)
 
 
-def make_member(uri: str, category: str, task: str, obstacles: bool, files: FileAccess) -> Member:
-    """Return a robot as a member of a split. Runs in a worker."""
+def make_member(task: str, obstacles: bool, files: FileAccess, row: Row) -> Member:
+    """Return the robot of a row as a member of a split. Runs in a worker."""
+    uri = row.uri
     if uri.startswith(MEMBER):
         return replace(resolve_member(uri, files), task=task, obstacles=obstacles)
     robot = read_robot_uri(uri, files)
@@ -80,21 +80,7 @@ def make_member(uri: str, category: str, task: str, obstacles: bool, files: File
         raise BenchmarkError(f"{uri} was imported: a split names robots by their derivations")
     composed = compose(parse_derivation(derivation), files.library, robot.name)
     hash_ = robot_hash(composed)
-    return Member(robot.name, category or COMPOSED, derivation, task, obstacles, hash_)
-
-
-def make_members(
-    rows: Sequence[Row], task: str, obstacles: bool, files: FileAccess, workers: Workers
-) -> list[Member]:
-    """Compose the robots of rows in the worker processes; return them as members of a split."""
-    futures = [
-        workers.submit(make_member, row.uri, row.category, task, obstacles, files) for row in rows
-    ]
-    members = []
-    for i, future in enumerate(futures, 1):
-        members.append(workers.result(future))
-        report(i, len(futures))
-    return members
+    return Member(robot.name, row.category or COMPOSED, derivation, task, obstacles, hash_)
 
 
 def save_split(
@@ -125,11 +111,7 @@ def study_split(split: Split, folders: tuple[Path, ...], workers: Workers) -> Sp
             "use morphgen split audit and morphgen split stats"
         )
     measure = partial(survey_robot, Library(folders), split.max_links)
-    futures = [workers.submit(measure, member) for member in different_members(split)]
-    robots = []
-    for i, future in enumerate(futures, 1):
-        robots.append(workers.result(future))
-        report(i, len(futures))
+    robots = list(workers.map(measure, different_members(split)))
     return workers.call(conclude_study, split, robots, folders)
 
 
@@ -175,12 +157,9 @@ def add_split_form(
 
         def compose_sides() -> Sides:
             """Compose the robots in the worker processes."""
-            files, workers = session.files, session.workers
+            make = partial(make_member, task.value, obstacles.value, session.files)
             with session.activity("composing {} robots"):
-                train, test = (
-                    make_members(rows, task.value, obstacles.value, files, workers)
-                    for rows in choose_sides()
-                )
+                train, test = (list(session.workers.map(make, rows)) for rows in choose_sides())
             return train, test
 
         return compose_sides

@@ -540,8 +540,8 @@ def test_new_split_is_saved_from_the_shown_robots(see, folder):
 
 def test_robots_of_a_set_become_members(folder, files, monkeypatch):
     monkeypatch.chdir(folder)
-    uris = [f"robots/prims/prims-{i:06d}" for i in range(4)]
-    members = [make_member(uri, "prims", "push", False, files) for uri in uris]
+    rows = [Row("", f"robots/prims/prims-{i:06d}", "prims") for i in range(4)]
+    members = [make_member("push", False, files, row) for row in rows]
     path = save_split("mine/prims", "interpolation", members[:3], members[3:], files)
     split = read_split(path)
     assert split.train == tuple(members[:3])

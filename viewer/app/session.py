@@ -99,10 +99,6 @@ class Session:
         """Run slow work on the session's background thread; see ``enqueue``."""
         self._submit(self.background, work, key)
 
-    def run_in_worker(self, work: Callable[..., T], *arguments: object) -> T:
-        """Run a function in a worker process and return its result."""
-        return self.workers.call(work, *arguments)
-
     @contextmanager
     def activity(self, text: str) -> Iterator[None]:
         """Show what a block does; with a ``{}`` for the number of items, show its progress."""

@@ -6,7 +6,7 @@ import functools
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from ctypes import c_byte
@@ -16,7 +16,9 @@ from typing import Any, TypeVar, cast
 
 from morphgen.errors import MorphgenError
 from morphgen.processes import call_in_worker, init_worker, sigint_blocked
+from morphgen.progress import report
 
+S = TypeVar("S")
 T = TypeVar("T")
 
 
@@ -75,6 +77,18 @@ class Workers:
     def call(self, work: Callable[..., T], *arguments: object) -> T:
         """Call a function in a process and return its result."""
         return self.result(self.submit(work, *arguments))
+
+    def map(self, work: Callable[[S], T], items: Sequence[S]) -> Iterator[T]:
+        """Call a function with every item; yield the results in order, and report how many."""
+        futures = [self.submit(work, item) for item in items]
+        try:
+            for i, future in enumerate(futures, 1):
+                result = self.result(future)
+                report(i, len(items))
+                yield result
+        finally:  # also if the caller wants no more
+            for future in futures:
+                future.cancel()
 
     def close(self) -> None:
         """End the processes; calls that run or wait are dropped."""

@@ -123,11 +123,11 @@ def _without(uris: tuple[str, ...], i: int) -> tuple[str, ...]:
 def _add_picker(session: Session, uris: tuple[str, ...]) -> None:
     lists = controls.robot_lists(uris[0] if uris else "", session.files, {})
     with session.client.gui.add_folder("Add a robot"):
-        picker = controls.add_picker(session, lists, lambda: uris[0] if uris else "")
+        picker = controls.RobotPicker(session, lists, lambda: uris[0] if uris else "")
         button = session.client.gui.add_button("Add", icon=viser.Icon.PLUS)
 
     def add() -> None:
-        session.open_address(Address("compare", (*uris, controls.picked_uri(picker))))
+        session.open_address(Address("compare", (*uris, picker.picked_uri())))
 
     session.on_change(picker.robot, add)
     session.on_change(button, add)
@@ -177,7 +177,7 @@ def _compare(page: ComparePage) -> None:
     try:
         folders = session.files.library_folders
         with session.activity("comparing"):
-            similarity = session.run_in_worker(compare_robots, page.robots, folders)
+            similarity = session.workers.call(compare_robots, page.robots, folders)
         content = f"<h3>Similarity</h3>{similarity_table(names, similarity)}"
     except MorphgenError as error:
         tag = markup.tag("cannot be compared", "warning")

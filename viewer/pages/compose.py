@@ -355,9 +355,13 @@ class GrammarTab(ComposingTab):
         session.on_change(start, lambda: self._start_from(start.value))
         session.on_change(self._text, self.show, "grammar")
         session.on_change(buttons, lambda: self._draw(buttons.value))
-        session.on_change(save, self._send)
+        session.on_change(
+            save, lambda: session.send_file(f"{self._name}{SUFFIX}", self._text.value.encode())
+        )
         session.on_change(self._num_parts, self._show_parts, "parts")
-        session.keep("text", self._write_text, self._apply_text)
+        session.keep(
+            "text", self._write_text, lambda text: set_value(self._text, unpack_text(text))
+        )
         for key, field in (("seed", self._seed), ("number", self._number)):
             session.on_change(field, lambda: self._draw("this"), "number")
             session.keep(
@@ -389,9 +393,6 @@ class GrammarTab(ComposingTab):
             except AddressError as error:
                 self._too_long.content = markup.framed(markup.dim(str(error)))
         return ""
-
-    def _apply_text(self, text: str) -> None:
-        set_value(self._text, unpack_text(text))
 
     @property
     def _is_shown(self) -> bool:
@@ -431,9 +432,6 @@ class GrammarTab(ComposingTab):
         is_here = place is not None and place["origin"] == self._name
         line, column = (int(place["line"]), int(place["column"])) if place and is_here else (0, 0)
         self._session.run_script(call("mark", line, column))
-
-    def _send(self) -> None:
-        self._session.send_file(f"{self._name}{SUFFIX}", self._text.value.encode())
 
     def _start_from(self, source: str) -> None:
         self._load(source)
@@ -595,14 +593,14 @@ class ComposePage:
         folder = bundle_folder(session.files.roots[0] / ROBOTS, robot.name)
         target = str(folder.relative_to(session.files.roots[0]))
         with session.activity(f"writing {target}"):
-            session.run_in_worker(_write_checked, robot, folder)
+            session.workers.call(_write_checked, robot, folder)
         session.notify("Written", target)
 
     def _send_bundle(self, name: str) -> None:
         session, robot = self._session, self._named_robot(name)
         folder = bundle_folder(Path(), robot.name).name  # validates the name
         with session.activity("packing the bundle"):
-            files = session.run_in_worker(new_bundle_files, robot)
+            files = session.workers.call(new_bundle_files, robot)
             session.send_file(f"{folder}.zip", zip_files(folder, files))
 
 

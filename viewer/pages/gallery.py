@@ -301,14 +301,7 @@ def _store_thumbnail(gallery: Gallery, uri: str, thumbnail: Thumbnail) -> None:
         gallery.thumbnails[uri] = thumbnail.image
     facts: dict[str, Any] = thumbnail.facts
     for rows in (gallery.rows, gallery.page_rows):
-        rows[:] = [_completed(row, facts) if row.uri == uri else row for row in rows]
-
-
-def _completed(row: robot_rows.Row, facts: Mapping[str, Any]) -> robot_rows.Row:
-    """Return a row with the facts that it lacks, and with the findings of the robot itself."""
-    return replace(
-        row, **{k: v for k, v in facts.items() if k == "findings" or getattr(row, k) is None}
-    )
+        rows[:] = [row.completed(facts) if row.uri == uri else row for row in rows]
 
 
 CONTROLS_WIDTH = 330.0  # width of the controls [pixels]

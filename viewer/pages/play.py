@@ -23,7 +23,7 @@ from morphgen.viewer import markup, rollout
 from morphgen.viewer.app.address import MAX_PLAYED, Address, AddressError
 from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.app.workers import named
-from morphgen.viewer.controls import Robots, add_picker, bind, picked_uri, robot_lists
+from morphgen.viewer.controls import RobotPicker, Robots, bind, robot_lists
 from morphgen.viewer.episode import Episode, episode_bytes, read_episode, score_until, snapshot
 from morphgen.viewer.robot_uri import DEFAULT_WORDS, EPISODE_SUFFIX, WORDS, FileAccess, uri_name
 from morphgen.viewer.scene.rollout import RolloutScene, add_episode, episode_page, show_step
@@ -138,9 +138,8 @@ class PlayPage:
             simulator = gui.add_dropdown("simulator", SIMULATOR_NAMES)
         with gui.add_folder("Robots"):
             lists = {"trained on": lambda: trained_on} if trained_on else {}
-            picker = add_picker(
-                session, robot_lists(robots[0], session.files, lists), lambda: robots[0]
-            )
+            offered = robot_lists(robots[0], session.files, lists)
+            picker = RobotPicker(session, offered, lambda: robots[0])
             action = gui.add_button_group("this robot", ACTIONS)
         session.keep("policy", lambda: policy.value)  # its default depends on the task
         bind(session, "seed", seed)
@@ -176,7 +175,7 @@ class PlayPage:
         def use_robot(action: str) -> None:
             """Apply one of ``ACTIONS`` to the robot that the user named or picked."""
             nonlocal robots
-            uri = picked_uri(picker)
+            uri = picker.picked_uri()
             if action == "add" and len(robots) >= MAX_PLAYED:
                 raise MorphgenError(f"at most {MAX_PLAYED} robots are shown")
             kept = {"add": robots, "replace": robots[1:], "only": ()}[action]
@@ -205,14 +204,14 @@ class PlayPage:
             with session.activity(f"making the {suffix} of {seconds:.2f} s"):
                 session.send_file(name, make(episode))
 
-        film = functools.partial(session.run_in_worker, named("morphgen.viewer.film:render_video"))
+        film = functools.partial(session.workers.call, named("morphgen.viewer.film:render_video"))
         downloads: tuple[tuple[str, str, Callable[[Episode], bytes]], ...] = (
             (f"Save episode ({EPISODE_SUFFIX})", EPISODE_SUFFIX, episode_bytes),
             ("Film (.mp4)", ".mp4", film),
             (
                 "Web page (.html)",
                 ".html",
-                lambda episode: session.run_in_worker(episode_page, episode, session.dark),
+                lambda episode: session.workers.call(episode_page, episode, session.dark),
             ),
         )
         with gui.add_folder("Get"):

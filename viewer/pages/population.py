@@ -25,7 +25,7 @@ from morphgen.formats.bundle import split_colours
 from morphgen.grammar.grammar_file import SUFFIX, grammar_names, grammar_text
 from morphgen.grammar.sampling import robot_name, sample_robot
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
-from morphgen.model.kinematics import joint_limits, reach
+from morphgen.model.kinematics import joint_limits
 from morphgen.model.kinematics_torch import KinematicTree, compile_tree, quaternion_from_matrix
 from morphgen.model.kinematics_torch import forward_kinematics as batch_forward_kinematics
 from morphgen.model.mesh import load_mesh
@@ -40,6 +40,7 @@ from morphgen.viewer.app.session import Session
 from morphgen.viewer.app.workers import Workers
 from morphgen.viewer.controls import RoleSliders, all_roles, bind, joint_roles
 from morphgen.viewer.pages.gallery import show_index
+from morphgen.viewer.robot_files import robot_facts
 from morphgen.viewer.robot_rows import UNITS, Row, facts_line, folder_rows, sort_rows, split_rows
 from morphgen.viewer.scene import stage
 from morphgen.viewer.scene.robot import robot_bounds
@@ -347,21 +348,12 @@ def read_robots(
                 codes = sorted({finding.code for finding in sample.findings})
                 row = replace(row, uri=uri, findings=tuple(codes))
             robot = split_colours(robot)
-            bounds = np.array(robot_bounds(robot))
-            results.append(ReadRobot(_measured(row, robot), robot, bounds))
+            if row.dof is None or row.reach is None:
+                row = row.completed(robot_facts(robot))
+            results.append(ReadRobot(row, robot, np.array(robot_bounds(robot))))
         except MorphgenError as error:
             results.append((row.name, files.redact(error)))
     return results
-
-
-def _measured(row: Row, robot: Robot) -> Row:
-    """Return a row with the facts that it lacks."""
-    facts: dict[str, object] = {}
-    if row.dof is None:
-        facts |= {"dof": robot.dof, "links": len(robot.links), "mass": robot.mass}
-    if row.reach is None and robot.tool and robot.dof:
-        facts["reach"] = reach(robot)
-    return replace(row, **facts)  # type: ignore[arg-type]
 
 
 Labels = list[tuple[str, tuple[float, float]]]  # texts on the ground and their positions [m]

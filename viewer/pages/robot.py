@@ -526,7 +526,7 @@ class Layers:
         if missing:
             text = f"fitting primitives to {len(missing)} links; this takes a while"
             with session.activity(text):
-                fitted = session.run_in_worker(as_primitives, robot, folders)
+                fitted = session.workers.call(as_primitives, robot, folders)
             primitives = {link.name: link.collisions for link in fitted.links}
         self._primitives = [primitives.get(link.name, ()) for link in robot.links]
         session.enqueue(lambda: self._show_layer("primitives"))
@@ -615,7 +615,7 @@ def _legend(sides: Array) -> str:
 def _add_downloads(page: RobotPage) -> None:
     """Add buttons for the bundle, its files, pictures and films, and the robot's command."""
     gui, session, robot = page.session.client.gui, page.session, page.robot
-    run, name = session.run_in_worker, page.robot.name or "robot"
+    run, name = session.workers.call, page.robot.name or "robot"
     turntable = named("morphgen.viewer.film:turntable")
     hint = "adds robot.html, which shows the robot in 3D without a server or a network"
     with_page = gui.add_checkbox("bundle with a web page", initial_value=False, hint=hint)
