@@ -20,17 +20,7 @@ from morphgen.grammar.library import Library
 from morphgen.grammar.robot_set import INDEX, read_index, read_settings
 from morphgen.grammar.robot_source import is_robot_folder
 from morphgen.splits.split import Split, sided_members
-from morphgen.viewer.robot_uri import (
-    DERIVATION,
-    WORDS,
-    FileAccess,
-    UriError,
-    member_split,
-    member_uri,
-    parent_folder,
-    resolve_split,
-    uri_name,
-)
+from morphgen.viewer import robot_uri
 
 T = TypeVar("T")
 
@@ -143,11 +133,11 @@ def facts_line(row: Row) -> str:
     return " · ".join(parts)
 
 
-def folder_rows(text: str, files: FileAccess) -> list[Row]:
+def folder_rows(text: str, files: robot_uri.FileAccess) -> list[Row]:
     """Return the robots in a folder: a set's from its index, bundles by their cards, URDFs."""
     folder = files.path(text)
     if not folder.is_dir():
-        raise UriError(f"{text}: not a folder")
+        raise robot_uri.UriError(f"{text}: not a folder")
     text = text.rstrip("/")
     if (folder / INDEX).is_file():
         return list(_set_rows(text, folder))
@@ -161,7 +151,9 @@ def folder_rows(text: str, files: FileAccess) -> list[Row]:
         ):
             rows.append(Row(path.name, uri, "description", order=len(rows)))
     if not rows:
-        raise UriError(f"{text} holds no robot; morphgen sample and morphgen compose make some")
+        raise robot_uri.UriError(
+            f"{text} holds no robot; morphgen sample and morphgen compose make some"
+        )
     return rows
 
 
@@ -189,7 +181,7 @@ def split_rows(name: str, split: Split) -> list[Row]:
     return [
         Row(
             member.name,
-            member_uri(name, side, member),
+            robot_uri.member_uri(name, side, member),
             member.category,
             side,
             task=member.task + (" with obstacles" if member.obstacles else ""),
@@ -199,21 +191,21 @@ def split_rows(name: str, split: Split) -> list[Row]:
     ]
 
 
-def sibling_rows(uri: str, files: FileAccess) -> list[Row]:
+def sibling_rows(uri: str, files: robot_uri.FileAccess) -> list[Row]:
     """Return the robots of the split or set that has a robot; none if it is in neither."""
-    if split := member_split(uri):
-        return split_rows(split, resolve_split(split, files))
-    folder = parent_folder(uri)
+    if split := robot_uri.member_split(uri):
+        return split_rows(split, robot_uri.resolve_split(split, files))
+    folder = robot_uri.parent_folder(uri)
     is_in_set = folder and (files.path(folder) / INDEX).is_file()
     return folder_rows(folder, files) if is_in_set else []
 
 
-def uri_rows(uris: Sequence[str], files: FileAccess) -> list[Row]:
+def uri_rows(uris: Sequence[str], files: robot_uri.FileAccess) -> list[Row]:
     """Return the rows of robots; those of sets and splits have the facts that these know."""
     rows = []
     for i, uri in enumerate(uris):
         known = (row for row in sibling_rows(uri, files) if row.uri == uri)
-        rows.append(replace(next(known, Row(uri_name(uri), uri)), order=i))
+        rows.append(replace(next(known, Row(robot_uri.uri_name(uri), uri)), order=i))
     return rows
 
 
@@ -223,9 +215,9 @@ def part_rows(library: Library) -> list[Row]:
     stored = stored_facts()
     for manifest in library.manifests():
         if manifest.kind in ("arm", "ee", "object") and manifest.name != "none":
-            uri = f"{WORDS}{manifest.kind}={manifest.name}"
+            uri = f"{robot_uri.WORDS}{manifest.kind}={manifest.name}"
         elif manifest.kind == "body":
-            uri = f"{DERIVATION}body={manifest.name}"
+            uri = f"{robot_uri.DERIVATION}body={manifest.name}"
         else:
             continue
         category = "template" if manifest.is_template else "real"
@@ -236,7 +228,7 @@ def part_rows(library: Library) -> list[Row]:
     return rows
 
 
-def neighbour_uris(uri: str, files: FileAccess) -> tuple[str, str]:
+def neighbour_uris(uri: str, files: robot_uri.FileAccess) -> tuple[str, str]:
     """Return the URIs of the previous and next robot in a robot's set or split, or empty texts."""
     uris = ["", *(row.uri for row in sibling_rows(uri, files)), ""]
     i = uris.index(uri.rstrip("/")) if uri.rstrip("/") in uris[1:-1] else 0
@@ -266,7 +258,9 @@ def _read_index(folder: Path, stamp: tuple[int, int]) -> tuple[dict[str, Any], .
     records = tuple(read_index(folder))
     for record in records:
         if missing := {*NUMBERS, "findings"} - record.keys():
-            raise UriError(f"{folder / INDEX}: a line has no {', '.join(sorted(missing))}")
+            raise robot_uri.UriError(
+                f"{folder / INDEX}: a line has no {', '.join(sorted(missing))}"
+            )
     return records
 
 

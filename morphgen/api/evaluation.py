@@ -48,20 +48,8 @@ from morphgen.rl.inference import (
     read_controller,
 )
 from morphgen.rl.inference import play as run_episodes
+from morphgen.rl.runs import robot_source
 from morphgen.rl.runs.checkpoint import RunConfig, read_checkpoint, read_config
-from morphgen.rl.runs.robot_source import (
-    FILE,
-    GrammarSource,
-    Source,
-    SplitSource,
-    fresh_source,
-    other_side,
-    side_of,
-    specs_of,
-    split_of,
-    tasks_of,
-    trained_on,
-)
 from morphgen.rl.runs.training import checkpoint_files
 from morphgen.rl.scores import Evaluation, Score
 from morphgen.rl.shipped_policies import checkpoint_path, is_named
@@ -245,7 +233,7 @@ def _rules_of(robots: str | PathLike[str] | None) -> EvalProtocol:
 
 def _plan_submission(
     given: SimpleNamespace,
-    source: Source,
+    source: robot_source.Source,
     config: EvalConfig,
     **facts: Any,  # noqa: ANN401
 ) -> Callable[[Iterable[Score]], None]:
@@ -256,12 +244,12 @@ def _plan_submission(
     if given.submission is None:
         return lambda scores: None
     path = path_argument("submission", given.submission, TaskError)
-    if not isinstance(source, SplitSource):
+    if not isinstance(source, robot_source.SplitSource):
         raise TaskError(f"--submission: {source.name} is no split; name one with --split")
     if given.on == "train":
         raise TaskError("--submission: the test robots are needed; leave --on train out")
     require_writable_file(path, "--submission")
-    split = split_of(source)
+    split = robot_source.split_of(source)
     rules = _rules_of(given.robots)
     goals = replace(rules.goals, seed=source.goal_seed, tasks=config.tasks)
     followed = EvalProtocol(config.sim, config.episodes, config.seed, goals).as_data(split)
@@ -292,16 +280,16 @@ def _baseline_scores(given: SimpleNamespace) -> dict[str, list[Score]]:
     _prepare(sources, config)
     scores: list[Score] = []
     for source in sources:
-        with stage(side_of(source)):
+        with stage(robot_source.side_of(source)):
             scores += evaluate_baseline(name, source, config)
     write(scores)
     return {name: scores}
 
 
-def _prepare(sources: Sequence[Source], config: EvalConfig) -> None:
+def _prepare(sources: Sequence[robot_source.Source], config: EvalConfig) -> None:
     """Make the goal sets of robots, and show how many are ready; evaluations find them made."""
     for source in sources:
-        specs_of(source, GoalConfig(tasks=config.tasks))
+        robot_source.specs_of(source, GoalConfig(tasks=config.tasks))
 
 
 def _policy_scores(given: SimpleNamespace) -> dict[str, list[Score]]:
@@ -333,15 +321,17 @@ def _policy_scores(given: SimpleNamespace) -> dict[str, list[Score]]:
         # A fine-tuned policy was trained before, by a run that its checkpoint does not describe.
         training=None if run.initial_checkpoint else Training(run.sim, run.ppo.total_timesteps),
     )
-    evaluated = others or [other_side(run.source, side) for side in _sides(given, run.source)]
+    evaluated = others or [
+        robot_source.other_side(run.source, side) for side in _sides(given, run.source)
+    ]
     _prepare(evaluated, config)
     results: dict[str, list[Score]] = {}
-    if given.robots is not None and isinstance(run.source, GrammarSource):
+    if given.robots is not None and isinstance(run.source, robot_source.GrammarSource):
         _warn_of_drawn(files[0].parent, sources)
     for mode in (given.mode,) if given.mode else MODES:
         scores = results[mode] = []
         for source in evaluated:
-            with stage(f"{mode} on {side_of(source)}"):
+            with stage(f"{mode} on {robot_source.side_of(source)}"):
                 scores += evaluate_checkpoints(files, source, config, mode, device=given.device)
     write(chain.from_iterable(results.values()))  # a submission is of one mode
     return results
@@ -349,48 +339,50 @@ def _policy_scores(given: SimpleNamespace) -> dict[str, list[Score]]:
 
 def _other_robots(
     given: SimpleNamespace, run: RunConfig, folder: Path, config: EvalConfig
-) -> list[Source]:
+) -> list[robot_source.Source]:
     """Return other robots to evaluate than the run's own: named ones, or fresh ones of grammars."""
     if given.robots is not None:
         return _sources(given)
-    if not isinstance(run.source, GrammarSource):
+    if not isinstance(run.source, robot_source.GrammarSource):
         return []
     if given.on == "train":
         raise TaskError(
             f"--on train: {run.source.name} has no split; its policy is scored on fresh robots"
         )
     goals = GoalConfig(tasks=_with_goal(config.tasks, [run.source], given))
-    fresh, line = fresh_source(
+    fresh, line = robot_source.fresh_source(
         folder, run.source, goals, given.seed, jobs=given.workers or usable_cores()
     )
     note(f"morphgen: {line}")
     return [fresh]
 
 
-def _warn_of_drawn(folder: Path, sources: list[Source]) -> None:
+def _warn_of_drawn(folder: Path, sources: list[robot_source.Source]) -> None:
     """Say which of the robots to evaluate were among the drawn robots of a run."""
-    if not (folder / FILE).is_file():
+    if not (folder / robot_source.FILE).is_file():
         unknown = "it is unknown whether the policy was trained on any of these robots"
-        note(f"morphgen: {folder} has no {FILE}: {unknown}")
+        note(f"morphgen: {folder} has no {robot_source.FILE}: {unknown}")
         return
-    names = [name for source in sources for name in trained_on(folder, source)]
+    names = [name for source in sources for name in robot_source.trained_on(folder, source)]
     if names:
         note(f"morphgen: the policy was trained on {', '.join(names)}")
 
 
-def _sides(given: SimpleNamespace, source: Source) -> tuple[Side, ...]:
+def _sides(given: SimpleNamespace, source: robot_source.Source) -> tuple[Side, ...]:
     if given.on is not None:
         return (given.on,)
-    return ("train", "test") if isinstance(source, SplitSource) else ("train",)
+    return ("train", "test") if isinstance(source, robot_source.SplitSource) else ("train",)
 
 
-def _sources(given: SimpleNamespace) -> list[Source]:
+def _sources(given: SimpleNamespace) -> list[robot_source.Source]:
     source = named_source(given)
-    return [other_side(source, side) for side in _sides(given, source)]
+    return [robot_source.other_side(source, side) for side in _sides(given, source)]
 
 
 def _with_goal(
-    configs: Iterable[TaskConfig], sources: list[Source], given: SimpleNamespace
+    configs: Iterable[TaskConfig], sources: list[robot_source.Source], given: SimpleNamespace
 ) -> tuple[TaskConfig, ...]:
     """Return configs with the goal of the given, which must be for a robot of the sources."""
-    return with_goal(configs, given.goal, (task for each in sources for task in tasks_of(each)))
+    return with_goal(
+        configs, given.goal, (task for each in sources for task in robot_source.tasks_of(each))
+    )

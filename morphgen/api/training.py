@@ -23,23 +23,8 @@ from morphgen.processes import usable_cores
 from morphgen.progress import note
 from morphgen.rl.agents import AGENTS, ME_GRAPH, preset_of
 from morphgen.rl.config import AgentSpec, configs_of, owners_of, parse_agent, parse_constants
+from morphgen.rl.runs import robot_source
 from morphgen.rl.runs.checkpoint import CHECKPOINT, CONFIG, RunConfig, read_checkpoint, read_config
-from morphgen.rl.runs.robot_source import (
-    GrammarSource,
-    OneRobot,
-    RecordedSource,
-    Source,
-    SplitSource,
-    draw,
-    drawn_source,
-    members,
-    num_drawn,
-    other_side,
-    robot_source,
-    split_of,
-    split_source,
-    tasks_of,
-)
 from morphgen.rl.runs.training import (
     ExecutionConfig,
     ShowMetrics,
@@ -202,7 +187,7 @@ def train(
     if drawn is None:
         if robot_seed is not None or held_out or slice_updates is not None:
             raise TaskError("robot_seed, held_out and slice_updates: only with drawn")
-        source: Source = other_side(named_source(given), on)
+        source: robot_source.Source = robot_source.other_side(named_source(given), on)
     else:
         source = _source_to_draw(given)
     # Positions came first and have no suffix.
@@ -215,7 +200,7 @@ def train(
     config = _with_networks_of(initial, agent, run_config(source, spec, given))
     require_simulator_device(config.sim, batch_device(config.sim, device))
     _require_used(config, given)
-    if isinstance(source, GrammarSource):
+    if isinstance(source, robot_source.GrammarSource):
         config = _with_drawn_robots(config, source, given)  # which takes minutes
     return train_run(folder, config, given)
 
@@ -247,7 +232,9 @@ def resumed_config(folder: Path, *, resume: bool) -> RunConfig | None:
     return read_config(folder) if resume and (folder / CONFIG).is_file() else None
 
 
-def named_source(given: SimpleNamespace, side: Side = "train") -> SplitSource | OneRobot:
+def named_source(
+    given: SimpleNamespace, side: Side = "train"
+) -> robot_source.SplitSource | robot_source.OneRobot:
     """Return the robots that a split, or the words of a robot and ``task=NAME``, describe."""
     text, folders = str(given.robots), library_folders(given.library)
     words = [text] if Path(text).exists() else text.split() or [text]
@@ -257,7 +244,7 @@ def named_source(given: SimpleNamespace, side: Side = "train") -> SplitSource | 
         if len(tasks) > 1 or not robot:
             raise TaskError(f"{text}: name a robot and one task, {_task_choices()}")
         TASKS[tasks[0]]  # raises if the task is unknown
-        return robot_source(
+        return robot_source.robot_source(
             robot,
             tasks[0],
             obstacles=given.obstacles,
@@ -288,7 +275,7 @@ def _task_choices() -> str:
 
 def split_side(
     split: str | PathLike[str], side: Side, goal_seed: int | None, library: Sequence[Path]
-) -> SplitSource:
+) -> robot_source.SplitSource:
     """Return a side of a split, with the goals that its folder ships."""
     definition, folder = read_split_or_folder(split)
     goals = folder if folder is not None and has_goals(folder) else None
@@ -299,10 +286,12 @@ def split_side(
             raise TaskError(f"--goal-seed {seed}: the goals in {goals} are of seed {shipped}")
         seed = shipped
     folders = tuple(library)
-    return split_source(definition, side=side, goal_seed=seed, goals=goals, library=folders)
+    return robot_source.split_source(
+        definition, side=side, goal_seed=seed, goals=goals, library=folders
+    )
 
 
-def _source_to_draw(given: SimpleNamespace) -> GrammarSource:
+def _source_to_draw(given: SimpleNamespace) -> robot_source.GrammarSource:
     """Return the source of the drawn robots of ``train``; none of them is drawn yet."""
     words, task = str(given.robots), str(given.robots).partition(" ")[0].removeprefix("task=")
     if words != f"task={task}":
@@ -313,7 +302,7 @@ def _source_to_draw(given: SimpleNamespace) -> GrammarSource:
         raise TaskError(f"--on {given.on}: drawn robots have no sides; --on goes with a split")
     for each in task.split(","):
         TASKS[each]  # raises if the task is unknown
-    return drawn_source(
+    return robot_source.drawn_source(
         given.drawn,
         task,
         seed=given.robot_seed or 0,
@@ -324,14 +313,14 @@ def _source_to_draw(given: SimpleNamespace) -> GrammarSource:
     )
 
 
-def run_config(source: Source, spec: AgentSpec, given: SimpleNamespace) -> RunConfig:
+def run_config(source: robot_source.Source, spec: AgentSpec, given: SimpleNamespace) -> RunConfig:
     """Return the configuration of a run from arguments of ``train``."""
     preset = preset_of(given.preset, spec.agent)
     changes = {**preset.constants, **read_constants(given.constants)}
     changes |= {"bf16": given.bf16, "compile": given.compile}
     spec = replace(spec, switches={**preset.switches, **spec.switches})
     steps = given.steps or preset.total_timesteps
-    policy, ppo = configs_of(spec, tasks_of(source), changes, steps)
+    policy, ppo = configs_of(spec, robot_source.tasks_of(source), changes, steps)
     return RunConfig(
         source,
         policy,
@@ -354,31 +343,31 @@ def read_constants(constants: Mapping[str, float] | Sequence[str]) -> dict[str, 
     return parse_constants(constants)
 
 
-def _max_links(source: Source) -> int:
+def _max_links(source: robot_source.Source) -> int:
     """Return the number of links that observations are padded to by default.
 
     For a split it is the split's number. For drawn robots, of which the largest is not known yet,
     it is the benchmark's. For one robot it is the benchmark's, or the number of the
     robot's links if these are more, as for a robot with two arms.
     """
-    if isinstance(source, SplitSource):
-        return split_of(source).max_links
-    if isinstance(source, GrammarSource):
+    if isinstance(source, robot_source.SplitSource):
+        return robot_source.split_of(source).max_links
+    if isinstance(source, robot_source.GrammarSource):
         return default_max_links([])
     robot = load_robot(source.name, library=map(Path, source.library))
     return default_max_links([len(robot.links)])
 
 
 def _task_configs(
-    source: Source, goal: str | None, num_goals: int | None
+    source: robot_source.Source, goal: str | None, num_goals: int | None
 ) -> tuple[TaskConfig, ...]:
     """Return the configurations of the tasks with a goal of reach and a number of goals."""
-    tasks = tasks_of(source)
+    tasks = robot_source.tasks_of(source)
     names = dict.fromkeys((*IN_EVERY_FILE, *tasks))
     configs = with_goal((TASKS[name].config_type() for name in names), goal, tasks)
     if num_goals is None:
         return configs
-    if isinstance(source, SplitSource) and source.goal_dir:
+    if isinstance(source, robot_source.SplitSource) and source.goal_dir:
         raise TaskError(
             f"--train-goals {num_goals}: {source.goal_dir} ships the goals to train on; name the "
             f"split itself, {source.name}, to have others"
@@ -423,7 +412,7 @@ def _require_used(config: RunConfig, given: SimpleNamespace) -> None:
 
 
 def _with_drawn_robots(
-    config: RunConfig, source: GrammarSource, given: SimpleNamespace
+    config: RunConfig, source: robot_source.GrammarSource, given: SimpleNamespace
 ) -> RunConfig:
     """Draw the robots of a run, after all that can be checked before; return its configuration."""
     if given.slice_updates is not None and num_slices(config) == 1:
@@ -434,7 +423,9 @@ def _with_drawn_robots(
     slice_updates = given.slice_updates or default_slice_updates(config)
     config = replace(config, slice_updates=slice_updates)
     require_runnable(config)
-    robots = draw(source, GoalConfig(tasks=config.tasks), jobs=given.workers or usable_cores())
+    robots = robot_source.draw(
+        source, GoalConfig(tasks=config.tasks), jobs=given.workers or usable_cores()
+    )
     if robots.skipped:
         reasons = ", ".join(f"{count} {reason}" for reason, count in robots.skipped.items())
         note(f"morphgen: robots that were skipped: {reasons}")
@@ -445,9 +436,9 @@ def _with_drawn_robots(
     return replace(config, source=drawn, max_links=max_links)
 
 
-def folder_name(source: Source) -> str:
+def folder_name(source: robot_source.Source) -> str:
     """Return the name of the folder of a run's robots."""
-    if isinstance(source, SplitSource):
+    if isinstance(source, robot_source.SplitSource):
         name = source.name + "-test" * (source.side == "test")
     else:
         name = f"{Path(source.name).name}-{source.task}" + "-obstacles" * source.obstacles
@@ -457,7 +448,10 @@ def folder_name(source: Source) -> str:
 def train_run(folder: Path, config: RunConfig, given: SimpleNamespace) -> TrainingRun:
     """Say what is trained, and train to the end of the run, or until it is stopped."""
     workers = getattr(given, "workers", None)
-    if isinstance(config.source, GrammarSource) and not SIMULATORS[config.sim].takes_workers:
+    if (
+        isinstance(config.source, robot_source.GrammarSource)
+        and not SIMULATORS[config.sim].takes_workers
+    ):
         workers = None  # the others have drawn the robots
     begun: list[str] = []
 
@@ -483,16 +477,16 @@ def train_run(folder: Path, config: RunConfig, given: SimpleNamespace) -> Traini
 
 def _described(folder: Path, config: RunConfig) -> str:
     source, ppo = config.source, config.ppo
-    if isinstance(source, RecordedSource):
+    what = f"{config.policy.agent} at {', '.join(robot_source.tasks_of(source))}"
+    if isinstance(source, robot_source.RecordedSource):
         return (
-            f"cloning {source.name} to {config.policy.agent} at {', '.join(tasks_of(source))}: "
-            f"{config.num_updates:,} gradient steps of {config.num_envs:,} recorded steps, "
-            f"networks on {config.device}; folder {folder}"
+            f"cloning {source.name} to {what}: {config.num_updates:,} gradient steps of "
+            f"{config.num_envs:,} recorded steps, networks on {config.device}; folder {folder}"
         )
-    number = len(members(source)) or num_drawn(source) or 1
+    number = len(robot_source.members(source)) or robot_source.num_drawn(source) or 1
     robots = "1 robot" if number == 1 else f"{number} robots"
     return (
-        f"training {config.policy.agent} at {', '.join(tasks_of(source))} on {source.name} "
-        f"({robots}): {ppo.total_timesteps:,} steps in {config.num_envs} environments of "
-        f"{config.sim}, networks on {config.device}; folder {folder}"
+        f"training {what} on {source.name} ({robots}): {ppo.total_timesteps:,} steps in "
+        f"{config.num_envs} environments of {config.sim}, networks on {config.device}; "
+        f"folder {folder}"
     )

@@ -34,16 +34,7 @@ from numpy.typing import NDArray
 from morphgen.benchmark.survey import SurveyedRobot, measure_robot
 from morphgen.benchmark.texts import read_text as package_text
 from morphgen.checks import check
-from morphgen.encoding.tokens import (
-    GEOMETRY,
-    LAYOUT,
-    LAYOUT_ARRAYS,
-    SHAPE_POSE,
-    TOKEN_SIZE,
-    TOLERANCE,
-    pad_tokens,
-    require_max_links,
-)
+from morphgen.encoding import tokens as encoding
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError
 from morphgen.files import file_sha256, write_atomic
 from morphgen.formats import bundle, records
@@ -153,7 +144,7 @@ def read_tokens(path: Path) -> tuple[list[str], NDArray[np.float64], NDArray[np.
     if (
         names.ndim != 1
         or mask.shape != (len(names), *mask.shape[1:2])
-        or tokens.shape != (*mask.shape, TOKEN_SIZE)
+        or tokens.shape != (*mask.shape, encoding.TOKEN_SIZE)
     ):
         shapes = ", ".join(str(array.shape) for array in (names, tokens, mask))
         raise BenchmarkError(f"{path}: names, tokens and mask are of shapes {shapes}")
@@ -254,7 +245,7 @@ def token_tables(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return tokens (n, max_links, 48) and mask (n, max_links) of all members."""
     tables = [known[member.robot_hash].tokens for _, member in sided_members(split)]
-    padded = [pad_tokens(table, split.max_links) for table in tables]
+    padded = [encoding.pad_tokens(table, split.max_links) for table in tables]
     return np.array([table for table, _ in padded]), np.array([mask for _, mask in padded])
 
 
@@ -267,7 +258,7 @@ def tokens_npz(split: Split, known: Mapping[str, SurveyedRobot]) -> bytes:
         tokens=tables,
         mask=mask,
         names=np.array([member.name for _, member in sided_members(split)]),
-        **LAYOUT_ARRAYS,
+        **encoding.LAYOUT_ARRAYS,
     )
     return content.getvalue()
 
@@ -413,7 +404,7 @@ def _write_member(
 ) -> _WrittenRobot:
     """Write the folder of a member, unless an earlier build has; runs in worker processes."""
     robot = compose_member(member, library)
-    require_max_links(len(robot.links), f"robot {member.name!r}", max_links)
+    encoding.require_max_links(len(robot.links), f"robot {member.name!r}", max_links)
     folder = bundle.bundle_folder(split_folder / ROBOTS_DIR, member.name)
     is_kept = not differences(folder, robot, light=settings.light)
     if is_kept and not settings.light:  # written in the same way by this version
@@ -639,15 +630,15 @@ def _token_differences(
         return
     # Primitives of meshes are fitted here, in the last bits otherwise than where it was built.
     errors = np.abs(tokens - computed)
-    for shape in (GEOMETRY, SHAPE_POSE):
-        errors[..., shape.columns] *= TOLERANCE / FITTED_TOLERANCE
+    for shape in (encoding.GEOMETRY, encoding.SHAPE_POSE):
+        errors[..., shape.columns] *= encoding.TOLERANCE / FITTED_TOLERANCE
     for i, name in enumerate(expected):
         if (mask[i] != computed_mask[i]).any():
             yield Difference(name, f"{path.name}: its mask is not that of its links")
-        wrong = ~(errors[i] <= TOLERANCE)  # NaN is wrong, too
+        wrong = ~(errors[i] <= encoding.TOLERANCE)  # NaN is wrong, too
         if wrong.any():
             link, column = np.argwhere(wrong)[0].tolist()
-            token_field = next(entry for entry in LAYOUT if column < entry.columns.stop)
+            token_field = next(entry for entry in encoding.LAYOUT if column < entry.columns.stop)
             yield Difference(
                 name, f"{path.name}: {token_field.name} of link {link} is not the robot's"
             )

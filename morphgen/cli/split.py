@@ -24,23 +24,7 @@ from morphgen.benchmark.licences import (
     restriction_line,
     restriction_text,
 )
-from morphgen.benchmark.scores.results import (
-    NOTE,
-    References,
-    collect_references,
-    floor,
-    method_rows,
-    ranked,
-    ranking_data,
-    ranking_table,
-    read_references,
-    reference_files,
-    result_rows,
-    result_tables,
-    rows_data,
-    smallest_differences,
-    study_results,
-)
+from morphgen.benchmark.scores import results as scores
 from morphgen.benchmark.scores.submission import (
     DEFAULT_EPISODES,
     EvalProtocol,
@@ -213,7 +197,7 @@ def difficulty(args: argparse.Namespace) -> None:
     splits = [split_folder.read_split_or_folder(name)[0] for name in args.splits]
     for split, name in zip(splits, args.splits, strict=True):
         opt.require_other_name(words, split.name, name)
-    results = [study_results(args.study, split) if args.study else {} for split in splits]
+    results = [scores.study_results(args.study, split) if args.study else {} for split in splits]
     library = opt.library_of(args)
     rows: list[survey.RobotDifficulty] = []
     for split, known in zip(splits, results, strict=True):
@@ -399,8 +383,10 @@ def release(args: argparse.Namespace) -> None:
     results: survey.BaselineResults = {}
     if args.scores:
         with bar(args, "checking the scores"):
-            references = collect_references(args.scores, split, protocol, library, jobs=args.jobs)
-        extra, results = reference_files(references), references.results()
+            references = scores.collect_references(
+                args.scores, split, protocol, library, jobs=args.jobs
+            )
+        extra, results = scores.reference_files(references), references.results()
     request = releases.ReleaseRequest(
         version=args.release_version,
         date=args.date,
@@ -492,20 +478,20 @@ def score(args: argparse.Namespace) -> int:
             "a release that has one (split release --scores)"
         )
     with status(args, "scoring"):
-        rows = method_rows(submissions, random) + references.rows()
-    smallest, lowest = smallest_differences(rows), floor([each for _, each in named])
+        rows = scores.method_rows(submissions, random) + references.rows()
+    smallest, lowest = scores.smallest_differences(rows), scores.floor([each for _, each in named])
     data: dict[str, Any] = {
         "split": split.name,
         "random": "release" if random else "submission",
         "warnings": warnings,
-        "rows": ranking_data(ranked(rows)),
+        "rows": scores.ranking_data(scores.ranked(rows)),
         "smallest_differences": smallest,
         "floor": lowest,
     }
     replays = _replays(args, submissions, split) if args.replay else []
     if args.replay:
         data["replays"] = [{"episode": line, "agrees": agrees} for line, agrees in replays]
-    notes = [NOTE, *map(_smallest_text, smallest)]
+    notes = [scores.NOTE, *map(_smallest_text, smallest)]
     for task, rates in lowest.items():
         names = ", ".join(f"{name} {rate:.0%}" for name, rate in rates.items())
         notes.append(f"floor of success of {task} (ZS): {names}")
@@ -518,7 +504,7 @@ def score(args: argparse.Namespace) -> int:
     notes += [f"warning: {text}" for text in warnings]
     notes += [line for line, _ in replays]
     style = "github" if args.markdown else "simple"
-    opt.print_result(args, data, lambda: "\n".join([ranking_table(rows, style), "", *notes]))
+    opt.print_result(args, data, lambda: "\n".join([scores.ranking_table(rows, style), "", *notes]))
     return int(not all(agrees for _, agrees in replays))
 
 
@@ -562,19 +548,19 @@ def _smallest_text(values: Mapping[str, Any]) -> str:
     )
 
 
-def _open(name: str, stack: ExitStack) -> tuple[Split, EvalProtocol, References, str]:
+def _open(name: str, stack: ExitStack) -> tuple[Split, EvalProtocol, scores.References, str]:
     """Return a split, its rules, reference scores, and the version of morphgen they are of."""
     path = Path(name)
     if not path.is_dir() and not split_folder.is_archive(path):
-        return read_split(name), EvalProtocol(), References(), version("morphgen")
+        return read_split(name), EvalProtocol(), scores.References(), version("morphgen")
     folder = stack.enter_context(releases.opened_folder(path))
     split_folder.require_unchanged(folder, name)
     split = read_split(folder / split_folder.SPLIT_FILE)
     if not releases.is_release(folder):
-        return split, EvalProtocol(), References(), version("morphgen")
+        return split, EvalProtocol(), scores.References(), version("morphgen")
     release = releases.read_release(folder)
     protocol = protocol_from(release.evaluation, name)
-    return split, protocol, read_references(folder), release.morphgen
+    return split, protocol, scores.read_references(folder), release.morphgen
 
 
 MODES = ("deterministic", "stochastic", "all")
@@ -592,6 +578,8 @@ def tables(args: argparse.Namespace) -> None:
             f"--mode {' or '.join(mode for mode in MODES if mode != args.mode)}"
         )
     with status(args, "scoring"):
-        rows = result_rows(found)
+        rows = scores.result_rows(found)
     style = "github" if args.markdown else "simple"
-    opt.print_result(args, rows_data(rows), lambda: f"{result_tables(rows, style)}\n{NOTE}")
+    opt.print_result(
+        args, scores.rows_data(rows), lambda: f"{scores.result_tables(rows, style)}\n{scores.NOTE}"
+    )

@@ -15,14 +15,7 @@ from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address
 from morphgen.viewer.app.session import Session
 from morphgen.viewer.figures import heatmap_svg, map_svg
-from morphgen.viewer.pages.gallery import (
-    Gallery,
-    add_controls,
-    load_pictures,
-    open_panels,
-    passing_rows,
-    show_index,
-)
+from morphgen.viewer.pages import gallery as gallery_page
 from morphgen.viewer.robot_rows import split_rows
 from morphgen.viewer.robot_uri import member_uri, resolve_member, resolve_split
 from morphgen.viewer.splits import SAVED_REGIMES, Sides, SplitStudy, add_save_form, study_split
@@ -39,7 +32,7 @@ class SplitPage:
     session: Session
     name: str  # name or file of the split, as in the address
     split: Split
-    gallery: Gallery
+    gallery: gallery_page.Gallery
     measure: viser.GuiDropdownHandle[str]
     study: SplitStudy | None = None
     texts: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
@@ -48,18 +41,18 @@ class SplitPage:
 def show(session: Session) -> None:
     """Build the page."""
     if not session.address.subject:
-        show_index(session)
+        gallery_page.show_index(session)
         return
     name = session.address.subject
     split = resolve_split(name, session.files)
-    gallery = Gallery(session, split.name, split_rows(name, split), SIDES)
+    gallery = gallery_page.Gallery(session, split.name, split_rows(name, split), SIDES)
     gui = session.client.gui
     header = _description(split) + _rollout_link(name, split)
     width = min(PANEL_WIDTH, PANEL_SHARE * session.width)
-    panel = open_panels(gallery, markup.breadcrumbs((split.name, None)), header, width)
+    panel = gallery_page.open_panels(gallery, markup.breadcrumbs((split.name, None)), header, width)
     tabs = gui.add_tab_group()
     with tabs.add_tab("Robots", viser.Icon.ROBOT):
-        add_controls(gallery)
+        gallery_page.add_controls(gallery)
         regime = split.regime if split.regime in SAVED_REGIMES else SAVED_REGIMES[0]
         add_save_form(
             session,
@@ -159,7 +152,7 @@ def _study(page: SplitPage) -> None:
     page.texts["audit"].content = markup.framed(audit_text(page.study.audit))
     _draw_map(page)
     uris = {member_uri(page.name, side, member) for side, member in page.study.members}
-    load_pictures(page.gallery, [row for row in page.gallery.rows if row.uri in uris])
+    gallery_page.load_pictures(page.gallery, [row for row in page.gallery.rows if row.uri in uris])
     _draw_map(page)
 
 
@@ -188,8 +181,8 @@ def _draw_map(page: SplitPage) -> None:
     )
 
 
-def _shown_sides(gallery: Gallery) -> Sides:
+def _shown_sides(gallery: gallery_page.Gallery) -> Sides:
     sides: dict[str, list[Member]] = {side: [] for side in SIDES}
-    for row in passing_rows(gallery):
+    for row in gallery_page.passing_rows(gallery):
         sides[row.role].append(resolve_member(row.uri, gallery.session.files))
     return sides["train"], sides["test"]
