@@ -180,8 +180,9 @@ def _drawn_splits(
         test.append(robot)
         report(len(train) + len(test), None)
     seeds = {stream.prefix: stream.seed for stream in (*train_streams, *test_streams)}
-    sides = (members(request, side) for side in (train, test))
-    return assemble(request, regime, summary, *sides, {**provenance, "seeds": seeds})
+    first, second = (members(request, side) for side in (train, test))
+    provenance = {**provenance, "seeds": seeds}
+    return assemble(request, regime, summary, first, second, provenance)
 
 
 def assemble(

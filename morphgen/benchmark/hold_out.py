@@ -710,5 +710,5 @@ def hold_out(
     if search.rejected:
         provenance["left_out"] = dict(sorted(Counter(search.rejected.values()).items()))
     summary = f"{{n}} robots without {' or '.join(map(str, rules))}; test: {request.test} with it"
-    sides = (members(request, side) for side in (named[: len(train)], named[len(train) :]))
-    return assemble(request, HOLD_OUT, summary, *sides, provenance)
+    first, second = (members(request, side) for side in (named[: len(train)], named[len(train) :]))
+    return assemble(request, HOLD_OUT, summary, first, second, provenance)

@@ -35,7 +35,6 @@ from morphgen.processes import parallel_stream
 from morphgen.progress import own_progress, show_progress
 from morphgen.rl.config import read_fields
 from morphgen.splits.candidates import RobotFactory, SampledRecipe, numbered_name
-from morphgen.splits.candidates import members as factory_members
 from morphgen.splits.split import Member, Side, Split, compose_member, split_id
 from morphgen.splits.split_file import (
     MemberRecord,
@@ -535,7 +534,7 @@ def _draw_one(
     """Return a robot with its environments, or the reason for skipping it and its error."""
     tasks = tasks_of(source)
     task = tasks[recipe.number % len(tasks)]
-    (member,) = factory_members((factory(recipe),), (task,), source.obstacles)
+    member = factory(recipe).member(task, (task,), source.obstacles)
     if member.robot_hash in held_out:
         return member, None, HELD_OUT, ""
     try:
