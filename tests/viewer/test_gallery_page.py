@@ -137,7 +137,6 @@ def test_split_is_created_from_filtered_robots(see, folder):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("", (0.5, 1.5)),
         ("0.7..1", (0.7, 1.0)),
         ("0..1", (0.5, 1.0)),
         ("1..inf", (1.0, 1.5)),

@@ -250,7 +250,7 @@ class Session:
         """Take over the address's state in the order of ``keep``; note what cannot be."""
         asked = self.address.state  # a new value may show the state, which changes the address
         for key, (_, apply) in list(self.values.items()):
-            if key in asked and apply is not None:
+            if asked.get(key) and apply is not None:
                 try:
                     apply(asked[key])
                 except AddressError as error:

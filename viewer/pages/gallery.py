@@ -19,7 +19,7 @@ from morphgen.splits.split_file import split_names
 from morphgen.viewer import figures, markup, robot_rows
 from morphgen.viewer.app.address import Address, AddressError, parse_count
 from morphgen.viewer.app.frame import call
-from morphgen.viewer.app.session import Session
+from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.app.uploads import store_upload
 from morphgen.viewer.app.workers import WorkerDied
 from morphgen.viewer.controls import bind
@@ -42,8 +42,6 @@ class Gallery:
     controls: dict[str, Any] = field(default_factory=dict)  # controls by their key in the address
     histograms: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
     """Distributions of the facts above their sliders."""
-    notices: list[str] = field(default_factory=list)
-    """Messages about values of the address that were left out; cleared when a control changes."""
     empty: str = ""  # HTML in place of the cards if no robot passes the filter
     grid: viser.GuiHtmlHandle | None = None
     summary: str = ""  # number of robots that pass the filter, and of the page
@@ -89,11 +87,7 @@ def draw_cards(gallery: Gallery) -> None:
     ]
     summary = f'<div class="dim" style="padding:.6em 0">{gallery.summary}</div>'
     content = f'<div class="columns">{"".join(html)}</div>' if gallery.page_rows else gallery.empty
-    notices = [
-        f"<div>{markup.tag('address', 'warning')} {escape(notice)}</div>"
-        for notice in gallery.notices
-    ]
-    shown = markup.framed(*notices, summary, content)
+    shown = markup.framed(summary, content)
     if gallery.session.width > NARROW:
         gallery.grid.content = shown
     else:
@@ -108,7 +102,7 @@ _SORTS = [key for name in robot_rows.SORTS for key in (name, f"-{name}")]
 
 
 def add_filter(gallery: Gallery) -> None:
-    """Add the controls in the state that the address gives; note values that it cannot have."""
+    """Add the controls; ``Session.apply_state`` gives them the values of the address."""
     session, gui = gallery.session, gallery.session.client.gui
     gallery.controls["search"] = gui.add_text("Search", "")
     bind(session, "search", gallery.controls["search"])
@@ -170,12 +164,8 @@ def show_histograms(gallery: Gallery) -> None:
         handle.content = markup.framed(f'<div class="histogram">{svg}</div>')
 
 
-def parse_range(
-    fact: str, text: str, limits: tuple[float, float] | None
-) -> tuple[float, float] | None:
+def parse_range(fact: str, text: str, limits: tuple[float, float] | None) -> tuple[float, float]:
     """Parse ``LOW..HIGH`` of an address."""
-    if not text:
-        return limits
     first, dots, last = text.partition("..")
     try:
         low, high = float(first), float(last if dots else "")
@@ -196,16 +186,12 @@ def parse_range(
 
 
 def _add_dropdown(gallery: Gallery, key: str, label: str, keys: Collection[str]) -> None:
-    """Add a dropdown if there is a choice; the first is the default."""
-    session, value = gallery.session, gallery.session.address.state.get(key, "")
-    if value and value not in keys:
-        valid = ", ".join(list(keys)[:12]) + (", ..." if len(keys) > 12 else "")
-        gallery.notices.append(f"{key}={value[:40]} was left out; expected {valid}")
-        session.address = session.address.with_state(**{key: ""})
-    labels = [_sort_label(gallery, k) for k in keys] if key == "sort" else keys
-    if len(keys) > 1:
-        gallery.controls[key] = session.client.gui.add_dropdown(label, tuple(labels))
-        bind(session, key, gallery.controls[key], tuple(keys))
+    """Add a dropdown, which is shown if there is a choice; the first is the default."""
+    gui, labels = gallery.session.client.gui, tuple(keys)
+    if key == "sort":
+        labels = tuple(_sort_label(gallery, each) for each in keys)
+    gallery.controls[key] = gui.add_dropdown(label, labels, visible=len(keys) > 1)
+    bind(gallery.session, key, gallery.controls[key], tuple(keys))
 
 
 def _role_name(gallery: Gallery) -> str:
@@ -225,18 +211,14 @@ def _add_range(gallery: Gallery, fact: str) -> None:
     """Add a slider with two ends for a fact that varies."""
     session, gui = gallery.session, gallery.session.client.gui
     limits = robot_rows.fact_range(gallery.rows, fact)
-    try:
-        ends = parse_range(fact, session.address.state.get(fact, ""), limits)
-    except AddressError as error:
-        gallery.notices.append(str(error))
-        ends = limits
-    if limits is None or ends is None or limits[0] == limits[1]:
+    if limits is None or limits[0] == limits[1]:
+        session.keep(fact, lambda: "", lambda text: parse_range(fact, text, limits))
         return
     step = 1.0 if fact in _COUNTS else 0.001
     low, high = limits[0] - limits[0] % step, limits[1] + (-limits[1]) % step
-    initial = (low if ends[0] == limits[0] else ends[0], high if ends[1] == limits[1] else ends[1])
     gallery.histograms[fact] = gui.add_html("")
-    slider = gallery.controls[fact] = gui.add_multi_slider(_LABELS[fact], low, high, step, initial)
+    slider = gui.add_multi_slider(_LABELS[fact], low, high, step, (low, high))
+    gallery.controls[fact] = slider
 
     def write() -> str:
         """Return the range for the address; empty if it lets every known value pass."""
@@ -244,7 +226,12 @@ def _add_range(gallery: Gallery, fact: str) -> None:
         known = robot_rows.fact_range(gallery.rows, fact) or limits
         return "" if low <= known[0] and high >= known[1] else f"{low:g}..{high:g}"
 
-    session.keep(fact, write)
+    def apply(text: str) -> None:
+        first, last = parse_range(fact, text, limits)
+        ends = low if first == limits[0] else first, high if last == limits[1] else last
+        set_value(slider, ends)
+
+    session.keep(fact, write, apply)
 
 
 REFRESH_INTERVAL = 0.6  # time after which a gallery shows the thumbnails drawn meanwhile [s]
@@ -351,16 +338,12 @@ def add_controls(gallery: Gallery) -> None:
     def turn_page() -> None:
         show_page(gallery, _PAGE_BUTTONS[buttons.value](gallery.page_number))
 
-    def changed() -> None:
-        gallery.notices.clear()
-        show_page(gallery, 1)
-
     def clear(key: str) -> None:
         clear_filter(gallery, key)
-        changed()
+        show_page(gallery, 1)
 
     for control in gallery.controls.values():
-        session.on_change(control, changed, "filter")
+        session.on_change(control, lambda: show_page(gallery, 1), "filter")
     session.on_change(buttons, turn_page)
     session.actions["clear filter"] = clear
     show_page(gallery, gallery.page_number)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import viser
-from viser.infra import StateSerializer
 
 from morphgen.model.geometry import Pose
 from morphgen.tasks.sim.base import Block
@@ -151,15 +150,10 @@ def episode_page(episode: Episode, dark: bool) -> bytes:
     """Return a web page that plays an episode without a server or a network."""
     with scene_server() as server:
         set_stage(server.scene, dark=dark)
-        recording = _record(server, episode)
+        scene = add_episode(server.scene, episode)
+        place_camera(server.initial_camera, scene.low, scene.high)
+        recording = server.get_scene_serializer()
+        for step in episode.film_steps:
+            show_step(scene, step)
+            recording.insert_sleep(STRIDE * episode.period)
         return web_page(recording, f"{episode.task}: {episode.tracks[0].robot.name}", dark=dark)
-
-
-def _record(server: viser.ViserServer, episode: Episode) -> StateSerializer:
-    scene = add_episode(server.scene, episode)
-    place_camera(server.initial_camera, scene.low, scene.high)
-    recording = server.get_scene_serializer()
-    for step in episode.film_steps:
-        show_step(scene, step)
-        recording.insert_sleep(STRIDE * episode.period)
-    return recording
