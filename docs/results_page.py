@@ -69,7 +69,6 @@ SHIPPED = {
     "pose": "`--goal pose`",
     "pose-obstacles": "`--goal pose --obstacles`",
     "push": "`--task push`",
-    "push-seed1": "`--task push`, another seed",
     **{task: f"`--task {task}`" for task in OBJECTS},
     **{
         f"elsewhere-{folder}-{task}": f"{task}, robots from elsewhere, {robots}"
@@ -166,7 +165,7 @@ def objects_table() -> str:
         found = [results_of("objects-30m", f"{split}/{task}") for task in OBJECTS]
         keys = {key for rows in found for key in rows}
         order = [*AGENTS, *BASELINES]
-        for key in sorted(keys, key=lambda key: order.index(key[0])):
+        for key in sorted(keys, key=lambda key: (order.index(key[0]), key[1])):
             rows = [each.get(key) for each in found]
             seeds = min((len(row.seeds) for row in rows if row), default=0)
             cells = [
@@ -190,7 +189,7 @@ def ee_task_table() -> str:
     order = [*AGENTS, *BASELINES]
     lines = []
     keys = [key for key in {*push, *reach} if key[0] in order]
-    for key in sorted(keys, key=lambda key: order.index(key[0])):
+    for key in sorted(keys, key=lambda key: (order.index(key[0]), key[1])):
         agent, steps = key
         rows = [found[key] for found in (push, reach) if key in found]
         pushing, reaching = (found[key].sides if key in found else {} for found in (push, reach))

@@ -1,10 +1,10 @@
-"""Film six arms that one policy reaches with: docs/images/zero_shot.gif; or other robots and tasks.
+"""Film ten arms at five tasks, with one policy a task: docs/images/zero_shot.gif; or other ones.
 
     python docs/zero_shot_film.py [--robots FILE ...] [--task reach ...] [--seed 3] [--out FILE]
 
 The policy of a task is the one that comes with morphgen, which was trained on none of these arms.
-Each has four episodes; arms that finish earlier wait for the others. With several tasks, each task
-has a row.
+Each arm has two episodes; arms that finish earlier wait for the others. With several tasks, each
+task has a row.
 """
 
 from __future__ import annotations
@@ -20,20 +20,14 @@ from morphgen.rl.inference import FPS, make_env_and_controller, play, read_contr
 from morphgen.rl.shipped_policies import zero_shot_policy
 from morphgen.tasks.render.renderer import write_video
 
-ROBOTS = (
-    "arm=ur5 ee=stick",
-    "arm=panda ee=panda_hand",
-    "arm=kinova_gen3 ee=robotiq_2f85",
-    "arm=widowx ee=widowx_gripper",
-    "arm=xarm7 ee=stick",
-    "arm=so101 ee=so101_gripper",
-)
+ARMS = ["ur5", "panda", "kinova_gen3", "xarm7", "iiwa14", "jaco2", "lwr", "widowx", "z1", "ur10"]
+ROBOTS = tuple(f"arm={arm} ee=stick" for arm in ARMS)
 TASKS = ("reach", "push", "drawer", "door", "dial")
 COLUMNS, MANY_COLUMNS = 3, 4
 """Columns of the film, and of one with more than six robots."""
-SIZE = (240, 180)
-EPISODES = 4
-STRIDE = 2
+SIZE = (112, 84)
+EPISODES = 2
+STRIDE = 4
 """Frames of an episode for a frame of the film."""
 REST = 25
 """Control steps that an arm stays at its goal."""
@@ -45,7 +39,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--robots", nargs="+", default=list(ROBOTS))
-    parser.add_argument("--task", nargs="+", choices=TASKS, default=["reach"])
+    parser.add_argument("--task", nargs="+", choices=TASKS, default=list(TASKS))
     parser.add_argument("--seed", type=int, default=3)
     images = Path(__file__).parent / "images"
     parser.add_argument("--out", type=Path, default=images / "zero_shot.gif")
