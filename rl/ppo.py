@@ -540,7 +540,8 @@ class Learner:
         """Return the weight of each robot's transitions, shape (R,), mean 1."""
         if not self.config.task_reweighting:
             return torch.ones(self.num_robots, device=self.device)
-        # Lin et al. 2022, "Reasonable effectiveness of random weighting".
+        # New ones for each gradient step (Lin et al. 2022, "Reasonable effectiveness of random
+        # weighting").
         normal = torch.empty(self.num_robots, device=self.device)
         normal.normal_(generator=self.generators["weights"])
         return self.num_robots * torch.softmax(normal, dim=0)

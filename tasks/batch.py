@@ -380,7 +380,10 @@ class TaskBatch:
         return self.groups.evaluate(task_state)
 
     def _begin(self, mask: torch.Tensor, options: Mapping[str, Any] | None = None) -> EpisodeRandom:
-        """Begin episodes in some environments, (n,), bool; return their random numbers."""
+        """Begin episodes in some environments, (n,), bool; return their random numbers.
+
+        ``options`` are those of ``reset``, where all environments begin.
+        """
         random = self._episodes.begin(mask)
         self.layouts.draw(mask, random)
         layout = self.layouts.current if self.layouts.any else None

@@ -366,6 +366,7 @@ def _with_surroundings(
 
     Links that are fixed to each other are never tested, as the ground and the root. Obstacles and
     bases of objects must be tested against the root: they are on virtual slides that stay at zero.
+    The block, or the link of the object that moves, has virtual joints for every direction.
     """
     robot = scene.robot
     link_names = {link.name for link in robot.links}

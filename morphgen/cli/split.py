@@ -451,7 +451,7 @@ def score(args: argparse.Namespace) -> int:
     submissions = [read_submission(path) for path in args.submissions]
     library = opt.library_of(args)
     name = args.split or submissions[0].split.name
-    if args.split is None and name not in split_names():  # a submission cannot name other files
+    if not args.split and name not in split_names():  # a submission cannot name other files
         raise BenchmarkError(
             f"{args.submissions[0]}: split.name: {name} is not a split that comes with morphgen; "
             "name its release or file with --split"

@@ -38,7 +38,7 @@ def format_numbers(values: Iterable[float]) -> str:
 
 def format_inertia(value: float) -> str:
     """Return an inertia with 12 digits; those of fingers are far below ``format_number``'s zero."""
-    return f"{value:.12g}" if abs(value) > 1e-18 else "0"
+    return "0" if abs(value) <= 1e-18 else f"{value:.12g}"
 
 
 def round_number(value: float) -> float:

@@ -157,7 +157,10 @@ def last_layer(inputs: int, outputs: int, scale: float = 1.0) -> nn.Linear:
 def _max_pool(
     encode: nn.Module, points: torch.Tensor, mask: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the largest features of points (PointNet, Qi et al. 2017), and if there are any."""
+    """Return the largest features of points (n, P, 3), as PointNet (Qi et al. 2017).
+
+    They have the shape (n, 1, features); with them is returned whether there is any point, (n, 1).
+    """
     features = encode(torch.where(mask[..., None], points, 0.0)).float()
     lowest = torch.finfo(features.dtype).min
     top = torch.where(mask[..., None], features, lowest).amax(dim=1, keepdim=True)

@@ -110,7 +110,7 @@ class InverseKinematics:
             rotation_weight=metres_per_radian,
             iterations=ITERATIONS,
         )
-        # From a goal that is a pose it is the larger one of position and rotation.
+        # [m]; from a goal that is a pose, the larger one of position and rotation.
         distance = torch.linalg.vector_norm(error.view(*error.shape[:2], -1, 3), dim=3).amax(dim=2)
         # A joint of two turns reaches a pose in two ways, of which one may outlast the episode.
         q = tables.nearest_turns(robots, q, now)

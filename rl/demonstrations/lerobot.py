@@ -217,7 +217,10 @@ def _place(file_index: int) -> dict[str, int]:
 
 
 def _columns(arrays: Arrays, num_joints: int, sizes: Mapping[str, int]) -> Arrays:
-    """Return the columns of a shard by feature, without those that its place determines."""
+    """Return the columns of a shard by feature, without those that its place determines.
+
+    ``num_joints`` is of the largest robot; ``sizes`` are of the observation fields of all tasks.
+    """
     columns: Arrays = {}
     for name, source in JOINTS.items():
         if source in arrays:  # the last one only with noise

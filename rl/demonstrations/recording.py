@@ -187,9 +187,8 @@ def record(folder: Path, config: RecordingConfig, *, jobs: int = 1, ray: str | N
     require_writable_folder(folder)
     tasks = tuple(dict.fromkeys(task for source in config.sources for task in tasks_of(source)))
     for task in tasks:
-        read_controller(
-            best_of(task, config.policy), task
-        )  # raises if the policy is not for the task
+        policy = best_of(task, config.policy)
+        read_controller(policy, task)  # raises if the policy is not for the task
     settings = config.as_data(tasks)
     if (folder / INFO).is_file():
         begin_folder(folder / RECORDING, settings, "data set", TaskError)

@@ -611,8 +611,9 @@ class BulletBatch:
     def _undisturbed(self, desired: Array) -> tuple[Array, Array]:
         """Return positions and velocities at the end of a control step without disturbances.
 
-        Effort limits and contacts show in the velocity that is measured afterwards, and carry over
-        to the next step.
+        Integrates the critically damped law of ``morphgen.model.dynamics`` in physics steps. Effort
+        limits and contacts are not modelled: they show in the velocity that is measured afterwards,
+        and carry over to the next step.
         """
         q, v = self._positions, self._velocities
         fastest, slowest = self._fastest, -self._fastest

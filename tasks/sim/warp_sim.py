@@ -153,7 +153,11 @@ def put_model(structure: Structure, device: str) -> Model:
 
 
 def _put_pairs(model: Model, structure: Structure) -> None:
-    """Have every world test its own pairs: those that some test have a margin for each world."""
+    """Have every world test its own pairs.
+
+    Those that only some test become contact pairs of MuJoCo, which have a margin for each world and
+    the material that all of them have; see ``_have_one_material``.
+    """
     pairs, some = structure.pairs, ~structure.tested.all(axis=0)
     count, first = int(some.sum()), structure.worlds[0].model
     numbers = np.full_like(pairs, -1)
