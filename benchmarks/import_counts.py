@@ -46,7 +46,6 @@ _STRUCTURAL = {
     "size-not-positive",
 }
 """Codes of findings that leave out an element without its count."""
-_INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _DEFAULTS = {
     ("origin", "xyz"): (0, 0, 0),
     ("origin", "rpy"): (0, 0, 0),

@@ -81,6 +81,7 @@ class Workers:
     def map(self, work: Callable[[S], T], items: Sequence[S]) -> Iterator[T]:
         """Call a function with every item; yield the results in order, and report how many."""
         futures = [self.submit(work, item) for item in items]
+        report(0, len(items))
         try:
             for i, future in enumerate(futures, 1):
                 result = self.result(future)
