@@ -204,6 +204,14 @@ def test_mutate_writes_neighbours_and_prints_their_changes(ok, cubes):
     ]
 
 
+def test_neighbours_meet_the_conditions_of_the_set(run, ok):
+    assert (
+        run("sample", "cubes", "-n", 1, "--light", "--where", "mass > 0.9", "--out", "set")[0] == 0
+    )
+    folders = json.loads(ok("mutate", "set/cubes-000000", "-n", 4, "--no-picture", "--json"))
+    assert all(read_bundle(Path(folder)).mass > 0.9 for folder in folders)
+
+
 @pytest.mark.parametrize(
     ("where", "refusal"),
     [

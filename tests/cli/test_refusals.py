@@ -38,6 +38,7 @@ ABBREVIATIONS = {
 """Words that several of the lines below begin with."""
 REFUSALS = """
 compose arm=ur55 ee=plane => ; your own parts need --library DIR
+compose arm=ur5 ee=stik => 'stick'? your own parts need --library DIR
 compose base=gantry ee=plane --library nowhere => nowhere does not exist
 compose chian beads=5 => 'chian' is neither a grammar nor of the form key=value; did you mean
 show nowhere.urdf => nowhere.urdf: no such file
@@ -52,6 +53,7 @@ conform . --samples 0 => argument --samples: 0: expected a whole number, 1 to 10
 import x.xacro --arg length => --arg length: expected NAME=VALUE
 import a.xml --part arm => --part: name the robot's licence by --licence, such as MIT
 import a.xml --licence MIT => --licence: only with --part
+import a.xml --parts parts => --parts: only with --part
 import a.xml --part arm --licence MIT --name 1st => digits and underscores, no digit first; import
 import a.xml --part ee --licence MIT => no frame 'tool', which is the flange or the tool of a
 import a.xml --part arm --licence MIT --tool left --name z1 => morphgen has a part of this name;
@@ -60,6 +62,9 @@ import a.xml b/a.xml => a.xml, b/a.xml: these would all be named 'a'; import one
 import a.xml b.xml --srdf a.srdf => --srdf a.srdf: is of one robot, and 2 are named; import its
 import 机器人.urdf a.xml => name '___': use letters
 export prims --format glb --spheres 4 => srdf, urdf, mjcf, sdf, curobo, usd or ros2
+export prims --format gif --dark => --dark: only with --format html
+export prims --format glb --samples 9 => --samples: only with --format srdf, curobo or ros2
+export prims --format curobo --cover 0.9 => --cover: only with --spheres
 export prims --out /dev/null => cannot write to /dev/null: /dev/null is a file
 export prims --format sfd => invalid choice: 'sfd'; did you mean 'sdf'?
 fit => name a part, a robot or a mesh file, or say --all
@@ -68,6 +73,10 @@ fit lost.stl => lost.stl: no such file
 fit flat.obj => flat.obj
 fit bare.urdf => robot 'r': no link has a shape
 fit plane --iou 0.9 => --iou: only with --max-primitives
+fit plane --missing => --missing: only with --all
+fit plane --configurations 9 => --configurations: only with --out
+fit plane --cover 0.9 => --cover: only with --spheres
+fit plane --spheres 4 --enclose => --enclose: only without --spheres
 fit --all --max-primitives 2 --seed 3 => --max-primitives --seed: only without --all
 fit plane --out .. => name
 fit plane --out file/made => cannot write to file: file is a file
@@ -112,11 +121,13 @@ split audit some.yaml --near 1 => --near 1: expected a tree distance and a cosin
 split audit some.yaml --near 2,0.5 => --near 2,0.5: a tree distance is from 0 to 1
 split build some.yaml --light --picture => choose one of light and picture
 split build some.yaml --out file => cannot write to file/mine/some: Not a directory
+split build some.yaml --goal-seed 1 => --goal-seed: only with --goals
 split stats wrong.yaml => robot 'planar-cube': the library has no part 'cubw'
 split difficulty some.yaml --csv some.yaml => --csv some.yaml: expected a name that ends in .csv
 RELEASE interpolation/arm3/reach --out file => cannot write to file: file is a f
 goals nowhere.yaml => nowhere.yaml: no such file
 goals interpolation/arm3/reach --task reach => is for a robot; interpolation/arm3/reach is a split
+goals some.yaml --obstacles => --obstacles: only with --task
 train --envs x => argument --envs: x: expected a whole number, 1 or more; see morphgen
 train interpolation/arm3/reech => did you mean 'interpolation/arm3/reach'?
 train planar-cube => a robot needs task=reach or task=push
@@ -153,6 +164,8 @@ eval random --split prims task=push --goal pose => is for task reach; the tasks 
 eval scripted --split planar-cube task=reach => no robot is there to push
 eval zero-shot --split interpolation/arm3/push => policy zero-shot was trained on reach, not on push
 eval zero --split some.yaml --method a => --method: only with --submission
+eval nothing --goal-seed 1 => --goal-seed: only with --split
+finetune nothing --obstacles => --obstacles: only with --split
 SUBMIT a.json --on train => leave --on train out
 SUBMIT none/a.json => there is no folder none
 SUBMIT a.json --episodes 2 => expected 34 or more
