@@ -20,8 +20,10 @@ from morphgen.rl.inference import FPS, make_env_and_controller, play, read_contr
 from morphgen.rl.shipped_policies import zero_shot_policy
 from morphgen.tasks.render.renderer import write_video
 
-ARMS = ["ur5", "panda", "kinova_gen3", "xarm7", "iiwa14", "jaco2", "lwr", "widowx", "z1", "ur10"]
-ROBOTS = tuple(f"arm={arm} ee=stick" for arm in ARMS)
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
+from robot_curve import REAL_ARMS
+
+ROBOTS = tuple(f"arm={arm} ee=stick" for arm in REAL_ARMS)
 TASKS = ("reach", "push", "drawer", "door", "dial")
 COLUMNS, MANY_COLUMNS = 3, 4
 """Columns of the film, and of one with more than six robots."""
