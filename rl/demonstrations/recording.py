@@ -415,7 +415,10 @@ def _run(
     config: RecordingConfig,
     generator: torch.Generator,
 ) -> tuple[EpisodeResults, list[dict[str, torch.Tensor]]]:
-    """Run an episode of every environment; return the results and all steps, (n, ...) each."""
+    """Run an episode of every environment; return the results and all steps, (n, ...) each.
+
+    The first controller acts. The actions of the last one are the labels.
+    """
     noise, hold = config.noise, config.hold
     batch.reset(seed=seeds)
     results = EpisodeResults(batch.num_envs, 1, batch.device)

@@ -1,4 +1,4 @@
-"""What the doctor finds of an installation, and versions of packages."""
+"""The doctor's findings about an installation, and versions of packages."""
 
 import importlib.metadata
 import json

@@ -1,4 +1,4 @@
-"""What a foreign file may read and how large it may be; hostile files; silence of packages."""
+"""Limits of foreign files: access and size; hostile files; silence of packages."""
 
 import math
 import os

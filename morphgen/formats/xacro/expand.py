@@ -237,8 +237,8 @@ def _load_engine() -> Engine:
     the size of text are bounded, ``node`` is the element being processed, and nothing is printed.
     """
     spec = importlib.util.find_spec("xacro")
-    assert spec is not None
-    assert spec.origin is not None
+    if spec is None or spec.origin is None:
+        raise ModuleNotFoundError("morphgen needs the package xacro: pip install xacro")
     private = importlib.util.spec_from_file_location(
         _NAME, spec.origin, submodule_search_locations=list(spec.submodule_search_locations or ())
     )
