@@ -8,7 +8,6 @@ single file the peak of memory and the CPU time of loading it are printed, too.
 
 from __future__ import annotations
 
-import json
 import re
 import resource
 import struct
@@ -18,14 +17,13 @@ import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from tabulate import tabulate
 
 from morphgen.errors import MeshError
 from morphgen.model.mesh_files import read_mesh_file
 
-SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
+SUFFIXES = (".dae", ".obj", ".ply", ".stl")
 
 
 def count_triangles(path: Path) -> int:
@@ -83,28 +81,6 @@ def _ply(data: bytes) -> int:
     return total
 
 
-def _glb(data: bytes) -> int:
-    (length,) = struct.unpack_from("<I", data, 12)
-    return _gltf(data[20 : 20 + length])
-
-
-def _gltf(data: bytes) -> int:
-    document = json.loads(data)
-
-    def size(primitive: dict[str, Any]) -> int:
-        accessor = primitive.get("indices", primitive["attributes"]["POSITION"])
-        count = document["accessors"][accessor]["count"]
-        mode = primitive.get("mode", 4)
-        return count // 3 if mode == 4 else count - 2 if mode in (5, 6) else 0
-
-    def below(index: int) -> int:
-        node = document["nodes"][index]
-        mesh = document["meshes"][node["mesh"]] if "mesh" in node else {"primitives": []}
-        return sum(map(size, mesh["primitives"])) + sum(map(below, node.get("children", [])))
-
-    return sum(map(below, document["scenes"][document.get("scene", 0)]["nodes"]))
-
-
 def _dae(data: bytes) -> int:
     root = ElementTree.fromstring(re.sub(rb'\sxmlns="[^"]*"', b"", data))
     nodes = {f"#{node.get('id')}": node for node in root.iter("node")}
@@ -147,8 +123,6 @@ def _dae_geometry(geometry: ElementTree.Element) -> int:
 
 _COUNTERS = {
     ".dae": _dae,
-    ".glb": _glb,
-    ".gltf": _gltf,
     ".obj": _obj,
     ".ply": _ply,
     ".stl": _stl,

@@ -66,10 +66,8 @@ def _require_mesh(data: bytes, suffix: str) -> None:
         raise ValueError("the file is a web page; download the mesh itself")
     kinds = {
         ".dae": start.startswith(b"<") and b"<collada" in start,
-        ".glb": data.startswith(b"glTF"),
         ".ply": re.match(rb"ply\s+format\s", data) is not None,
         ".stl": re.match(rb"solid\b.*\s+facet\s+normal\s", start) is not None,
-        ".gltf": start.startswith(b"{") and b'"asset"' in start,
     }
     actual = next((kind for kind, matches in kinds.items() if matches and kind != suffix), None)
     if actual is not None and not kinds.get(suffix):
@@ -403,8 +401,6 @@ def _materials(libraries: list[str], used: set[str], files: scene_files.FolderRe
 
 _READERS: dict[str, Callable[[bytes, scene_files.FolderResolver], list[MeshPart]]] = {
     ".dae": scene_files.read_dae,
-    ".glb": scene_files.read_glb,
-    ".gltf": scene_files.read_gltf,
     ".obj": _read_obj,
     ".ply": _read_ply,
     ".stl": _read_stl,

@@ -1,6 +1,6 @@
-"""Read the scenes of COLLADA and glTF files from untrusted sources, with bounds for all meshes.
+"""Read the scenes of COLLADA files from untrusted sources, with bounds for all meshes.
 
-COLLADA files declare two properties of their coordinates, and robot descriptions rely on the first:
+These files declare two properties of their coordinates, and robot descriptions rely on the first:
 
 * ``<unit meter="...">`` is applied. All seven visuals of the KUKA KR210 are in inches by that
   element, and only with it do they match the same links' collision STLs (mean overlap of the
@@ -9,18 +9,14 @@ COLLADA files declare two properties of their coordinates, and robot description
   can be compared with another mesh of the same part matches it without a rotation: PR2 (14 visuals
   against collision STLs, mean overlap 0.94, rotated to z up 0.41), Kinova (7 against STLs, equal
   bounds), Robotiq 2F-85 (3 against ``Z_UP`` files, equal bounds), Baxter's torso (0.99, rotated
-  0.14). None matches better when rotated. RViz, Pinocchio and PyBullet ignore the element too. For
-  the same reason, glTF files are not rotated from y up.
+  0.14). None matches better when rotated. RViz, Pinocchio and PyBullet ignore the element too.
 
 trimesh applies neither; it applies the transforms of the scene graph, as does this module.
 """
 
 from __future__ import annotations
 
-import base64
-import binascii
 import io
-import json
 import logging
 import math
 import re
@@ -28,8 +24,6 @@ import stat
 import struct
 import warnings
 from collections import Counter
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -124,11 +118,11 @@ class FolderResolver(trimesh.resolvers.Resolver):
             raise ValueError(f"it names files of more than {MAX_FILE_SIZE} bytes")
         return path.read_bytes()
 
-    def has_picture(self, name: str, read: Callable[[], bytes] | None = None) -> bool:
+    def has_picture(self, name: str) -> bool:
         """Return whether a texture can be read; if not, note it as left out."""
         try:
             if self._pixels_left >= 0:  # otherwise not even decoded
-                width, height = read_picture(read() if read else self.get(name)).size
+                width, height = read_picture(self.get(name)).size
                 self._pixels_left -= width * height
             if self._pixels_left < 0:
                 raise ValueError(f"the textures have more than {MAX_PIXELS} pixels")
@@ -260,248 +254,7 @@ _MAX_DEPTH = 100  # largest nesting depth of nodes in a scene
 MAX_DAE_SIZE = 40 * 2**20
 """Size of the largest DAE file: its numbers as text take twenty times their bytes [bytes]."""
 _MAX_MARKUP = 500_000
-"""Number of elements and attributes, or of JSON values, in the largest scene that is read."""
-
-
-_COMPONENT_SIZES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
-_ACCESSOR_SIZES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-_ATTRIBUTES = ("POSITION", "TEXCOORD_0", "COLOR_0")  # attributes of a glTF primitive that are read
-_HARMLESS_EXTENSIONS = re.compile(r"KHR_(materials|texture|lights)_\w+|EXT_texture_\w+|KHR_xmp\w*")
-"""Extensions of glTF that do not change triangles."""
-_GLTF_MODES = {0: "point sets", 1: "line sets", 2: "line loops", 3: "line strips", 6: "fans"}
-
-
-def read_glb(data: bytes, files: FolderResolver) -> list[MeshPart]:
-    """Read a binary glTF file as ``read_gltf`` reads a document."""
-    if len(data) < 20 or data[:4] != b"glTF":
-        raise ValueError("does not begin as a binary glTF file")
-    version, size, length = struct.unpack_from("<III", data, 4)
-    if version != 2:
-        raise ValueError(f"glTF version {version}; expected 2")
-    if size > len(data) or 20 + length > len(data):
-        raise ValueError(f"its header counts {size} bytes, it has {len(data)}: it is truncated")
-    binary = None
-    start = 20 + length
-    while binary is None and len(data) - start >= 8:
-        chunk, kind = struct.unpack_from("<I4s", data, start)
-        binary = data[start + 8 : start + 8 + chunk] if kind == b"BIN\0" else None
-        start += 8 + chunk
-    return read_gltf(data[20 : 20 + length], files, binary)
-
-
-def read_gltf(text: bytes, files: FolderResolver, binary: bytes | None = None) -> list[MeshPart]:
-    """Read a glTF document by trimesh, reduced to triangles whose bytes exist."""
-    if sum(text.count(mark) for mark in b",:[{") > _MAX_MARKUP:
-        raise ValueError(f"more than {_MAX_MARKUP} JSON values")
-    document = json.loads(text)
-    if not isinstance(document, dict) or not isinstance(document.get("asset"), dict):
-        raise ValueError("does not contain a glTF document")
-    for name in ("accessors", "bufferViews", "buffers", "images", "materials", "meshes", "nodes"):
-        entries = document.setdefault(name, [])
-        if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-            raise ValueError(f"its {name!r} are not a list of objects")
-    required = [str(name) for name in document.get("extensionsRequired", ())]
-    unread = [name for name in required if not _HARMLESS_EXTENSIONS.fullmatch(name)]
-    if unread:
-        raise ValueError(f"it requires the extension {', '.join(unread)}, which is not read")
-    buffers = _gltf_buffers(document, files, binary)
-    views = [_gltf_view(view, buffers) for view in document["bufferViews"]]
-    if sum(map(len, views)) > 2 * MAX_FILE_SIZE:
-        raise ValueError("its buffer views overlap, more than twice the largest file")
-    _gltf_primitives(document, views, files)
-    _gltf_textures(document, views, files)
-    triangles, pieces = _gltf_nodes(document, files)
-    require_faces(triangles)
-    require_sets(pieces)
-    if not triangles:
-        raise ValueError("its scene holds no triangle")
-    scene = trimesh.load_scene(
-        io.BytesIO(json.dumps(document).encode()), file_type="gltf", process=False, resolver=files
-    )
-    read = scene_parts(scene)
-    note_missing(files, triangles, read)
-    return read
-
-
-def _gltf_buffers(
-    document: dict[str, Any], files: FolderResolver, binary: bytes | None
-) -> list[memoryview]:
-    """Read every buffer once; the document then names them by their index."""
-    buffers = []
-    for i, buffer in enumerate(document["buffers"]):
-        uri = buffer.get("uri")
-        if uri is None:
-            if binary is None or i:
-                raise ValueError(f"buffer {i} has no bytes")
-            content = binary
-        else:
-            content = _uri_bytes(str(uri), files)
-        if buffer["byteLength"] > len(content):
-            raise ValueError(
-                f"buffer {i} counts {buffer['byteLength']} bytes, and has {len(content)}: it is "
-                "truncated"
-            )
-        buffer["uri"] = f"buffer {i}"
-        files.written[buffer["uri"]] = content
-        buffers.append(memoryview(content))
-    return buffers
-
-
-def _uri_bytes(uri: str, files: FolderResolver) -> bytes:
-    if not uri.startswith("data:"):
-        return files.get(uri)
-    try:
-        return base64.b64decode(uri.partition(",")[2])
-    except binascii.Error as error:
-        raise ValueError(f"data URI: {error}") from error
-
-
-def _gltf_view(view: dict[str, Any], buffers: list[memoryview]) -> memoryview:
-    buffer = buffers[_index(view["buffer"], buffers, "buffer")]
-    start, length = _natural(view.get("byteOffset", 0)), _natural(view["byteLength"])
-    if start + length > len(buffer):
-        raise ValueError(f"a view ends at byte {start + length} of a buffer of {len(buffer)}")
-    return buffer[start : start + length]
-
-
-def _natural(value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise ValueError(f"{value!r} is not a count; expected a whole number from 0")
-    return value
-
-
-def _index(value: object, entries: list[Any], name: str) -> int:
-    index = _natural(value)
-    if index >= len(entries):
-        raise ValueError(f"{name} {index}; the file has {len(entries)}")
-    return index
-
-
-def _gltf_primitives(
-    document: dict[str, Any], views: list[memoryview], files: FolderResolver
-) -> None:
-    """Reduce meshes to triangles and what colours them, and require the bytes of both."""
-    accessors = document["accessors"]
-    used: set[int] = set()
-    for mesh in document["meshes"]:
-        lost = [_GLTF_MODES[p["mode"]] for p in mesh["primitives"] if p.get("mode") in _GLTF_MODES]
-        files.left_out += [f"{kind} of a mesh" for kind in lost]
-        if any(mesh.get("weights", ())):
-            files.left_out.append("the default weights of morph targets")
-        primitives = [p for p in mesh["primitives"] if p.get("mode", 4) in (4, 5)]
-        for primitive in primitives:
-            attributes = primitive["attributes"]
-            kept = {name: attributes[name] for name in _ATTRIBUTES if name in attributes}
-            indices = [*kept.values(), *([primitive["indices"]] if "indices" in primitive else [])]
-            used.update(_index(index, accessors, "accessor") for index in indices)
-            if accessors[kept["POSITION"]].get("normalized"):
-                raise ValueError("its vertices are normalised integers, which are not read")
-            primitive["attributes"] = kept
-            for key in ("targets", "extensions"):
-                primitive.pop(key, None)
-        mesh.clear()  # also of extensions, which trimesh would follow
-        mesh["primitives"] = primitives
-    total = 0
-    for i, accessor in enumerate(accessors):
-        if i in used:
-            total += _require_accessor(i, accessor, document["bufferViews"], views)
-        else:
-            accessor.clear()
-            accessor.update(componentType=5121, type="SCALAR", count=0)
-    if total > 2 * MAX_FILE_SIZE:
-        raise ValueError(f"its accessors hold {total} bytes; at most {2 * MAX_FILE_SIZE} are read")
-
-
-def _require_accessor(
-    i: int, accessor: dict[str, Any], descriptions: list[Any], views: list[memoryview]
-) -> int:
-    """Return an accessor's bytes; raise ValueError if its view has fewer."""
-    if "bufferView" not in accessor or "sparse" in accessor:
-        kind = "sparse" if "sparse" in accessor else "without a buffer view"
-        raise ValueError(f"accessor {i} is {kind}; expected all of its entries in a buffer")
-    view = _index(accessor["bufferView"], views, "buffer view")
-    count, start = _natural(accessor["count"]), _natural(accessor.get("byteOffset", 0))
-    row = _COMPONENT_SIZES[accessor["componentType"]] * _ACCESSOR_SIZES[accessor["type"]]
-    stride = _natural(descriptions[view].get("byteStride", row))
-    if count and start + (count - 1) * stride + row > len(views[view]):
-        raise ValueError(
-            f"accessor {i} counts {count} entries of {row} bytes; its buffer view has "
-            f"{len(views[view])} bytes"
-        )
-    if "byteStride" in descriptions[view] and stride < row:
-        raise ValueError(f"buffer view {view} has a stride of {stride} bytes for rows of {row}")
-    return count * row
-
-
-def _gltf_textures(
-    document: dict[str, Any], views: list[memoryview], files: FolderResolver
-) -> None:
-    """Keep the pictures of base colours that can be read."""
-    images = document["images"]
-    textures = document.get("textures", [])
-    used: Counter[int] = Counter()
-    for material in document["materials"]:
-        texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {}).get("index")
-        if texture is not None:
-            texture = textures[_index(texture, textures, "texture")]
-            webp = texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source")
-            used[_index(texture.get("source", webp), images, "image")] += 1
-
-    def content(image: dict[str, Any]) -> bytes:
-        if "bufferView" in image:
-            return bytes(views[_index(image["bufferView"], views, "buffer view")])
-        return _uri_bytes(str(image["uri"]), files)
-
-    for i, image in enumerate(images):
-        name = str(image.get("name", image.get("uri", i)))[:100]
-        uses = (files.has_picture(name, partial(content, image)) for _ in range(used[i]))
-        if not used[i] or not all(uses):
-            image.clear()
-
-
-def _gltf_nodes(document: dict[str, Any], files: FolderResolver) -> tuple[int, int]:
-    """Return the numbers of triangles and of their sets in the scene, every instance counted."""
-    nodes, meshes, accessors = (document[name] for name in ("nodes", "meshes", "accessors"))
-
-    def triangles_of(primitive: dict[str, Any]) -> int:
-        corners = primitive.get("indices", primitive["attributes"]["POSITION"])
-        count: int = accessors[corners]["count"]
-        return max(count - 2, 0) if primitive.get("mode", 4) == 5 else count // 3  # 5: a strip
-
-    sizes = [(sum(map(triangles_of, m["primitives"])), len(m["primitives"])) for m in meshes]
-    scenes = document.get("scenes", [])
-    stack = []
-    if scenes:
-        roots = scenes[_index(document.get("scene", 0), scenes, "scene")].get("nodes", [])
-        stack = [(_index(node, nodes, "node"), 0) for node in roots]
-    visited: set[int] = set()
-    triangles = pieces = 0
-    placed: set[int] = set()
-    while stack:
-        index, depth = stack.pop()
-        if index in visited:
-            raise ValueError(f"node {index} has two parents or contains itself")
-        if depth > _MAX_DEPTH or len(visited) > _MAX_NODES:
-            raise ValueError(f"more than {_MAX_NODES} nodes, or {_MAX_DEPTH} levels of them")
-        visited.add(index)
-        node = nodes[index]
-        node.pop("camera", None)
-        node.pop("extras", None)
-        if "EXT_mesh_gpu_instancing" in node.pop("extensions", {}):
-            files.left_out.append("instances by EXT_mesh_gpu_instancing")
-        if "skin" in node:
-            files.left_out.append("a skin, whose mesh is drawn as it lies in the file")
-        if "mesh" in node:
-            mesh = _index(node["mesh"], meshes, "mesh")
-            placed.add(mesh)
-            triangles += sizes[mesh][0]
-            pieces += sizes[mesh][1]
-        stack += [(_index(child, nodes, "node"), depth + 1) for child in node.get("children", [])]
-    if unplaced := len(meshes) - len(placed):
-        files.left_out.append(f"{unplaced} meshes that its scene does not place")
-    return triangles, pieces
-
-
+"""Number of elements and attributes in the largest scene that is read."""
 _XML_ENCODINGS = ("ascii", "iso-8859-1", "latin1", "us-ascii", "utf-8", "utf8", "windows-1252")
 _COLLADA_PARTS = {
     *("asset", "scene", "library_effects", "library_geometries", "library_images"),

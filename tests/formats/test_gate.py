@@ -95,13 +95,6 @@ MJCF_ELEMENTS = {
 """Elements of an MJCF that name a file: the text before its body, and that in it."""
 MESH_FILES = {
     "material library": ("obj", "mtllib {uri}\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
-    "buffer": (
-        "gltf",
-        '{{"asset": {{"version": "2.0"}}, "scenes": [{{"nodes": [0]}}], "nodes": [{{"mesh": 0}}], '
-        '"meshes": [{{"primitives": [{{"attributes": {{"POSITION": 0}}}}]}}], "accessors": '
-        '[{{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}}], "bufferViews": '
-        '[{{"buffer": 0, "byteLength": 36}}], "buffers": [{{"byteLength": 36, "uri": "{uri}"}}]}}',
-    ),
     "image": (
         "dae",
         '<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1"><asset/>'

@@ -52,7 +52,7 @@ _SUFFIXES = (".urdf", ".xml")  # suffixes of descriptions
 _Documents = dict[str, etree._Element | FormatError]
 """Roots of descriptions by their paths, or why a file is not XML."""
 _FILE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,99}")
-_MESH_PARTS = (".bin", ".jpeg", ".jpg", ".mtl", ".png")  # suffixes of files that meshes refer to
+_MESH_PARTS = (".jpeg", ".jpg", ".mtl", ".png")  # suffixes of files that meshes refer to
 _PATH_ATTRIBUTES = (
     *("assetdir", "file", "filename", "meshdir", "texturedir"),
     *(f"file{side}" for side in ("back", "down", "front", "left", "right", "up")),
