@@ -1,7 +1,7 @@
 """Quality of primitive fits, compared with trimesh's tightest bound and scikit-robot.
 
     python benchmarks/fit_quality.py [--only ur5,panda] [--solid link,as-read]
-        [--fits one,four,enclose] [--jobs 2] [--json rows.json]
+        [--fits one,four] [--jobs 2] [--json rows.json]
 
 Measures every link of every real arm. All methods use the same solid and the measure of
 `morphgen.fitting.quality`. Prints one table per definition of the solid:
@@ -16,8 +16,6 @@ A row is an arm; values are means over its links (links with the same meshes are
 
 - IoU of one primitive: trimesh's tightest of oriented box, cylinder and sphere (AnyBody's method),
   scikit-robot's, ours; ours with up to four primitives, and their number.
-- Enclosing fits: volume divided by the solid's volume, and the smallest coverage, of scikit-robot's
-  and ours.
 - CPU seconds per link, for ours including the measurement: scikit-robot's, ours with one primitive
   and with up to four.
 
@@ -63,27 +61,10 @@ Row = dict[str, float]
 """Measured values of a link by column."""
 FOUR = ("ur5", "panda", "xarm7", "jaco2")
 """The arms for which issues of this project set targets."""
-FITS = {
-    "one": FitOptions(),
-    "four": FitOptions(max_primitives=4, iou=1.0),
-    "enclose": FitOptions(enclose=True),
-}
+FITS = {"one": FitOptions(), "four": FitOptions(max_primitives=4, iou=1.0)}
 """Fits that are measured, by their name in the columns."""
-COLUMNS: dict[str, Callable[[Sequence[Row], str], float]] = {
-    "iou trimesh": lambda rows, key: _mean(rows, key),
-    "iou skrobot": lambda rows, key: _mean(rows, key),
-    "iou one": lambda rows, key: _mean(rows, key),
-    "iou four": lambda rows, key: _mean(rows, key),
-    "n four": lambda rows, key: _mean(rows, key),
-    "volume skrobot": lambda rows, key: _mean(rows, key),
-    "volume enclose": lambda rows, key: _mean(rows, key),
-    "coverage skrobot": lambda rows, key: min(row[key] for row in rows),
-    "coverage enclose": lambda rows, key: min(row[key] for row in rows),
-    "s skrobot": lambda rows, key: _mean(rows, key),
-    "s one": lambda rows, key: _mean(rows, key),
-    "s four": lambda rows, key: _mean(rows, key),
-}
-"""Columns of the table, and how the values of the links are combined."""
+IOUS = ("iou trimesh", "iou skrobot", "iou one", "iou four")
+COLUMNS = (*IOUS, "n four", "s skrobot", "s one", "s four")
 
 
 @dataclass(frozen=True)
@@ -149,7 +130,10 @@ def _print(found: Mapping[str, Sequence[Row]]) -> None:
     # Rows of earlier runs may have columns that others lack.
     measured = set.intersection(*(set(row) for of in found.values() for row in of))
     columns = [name for name in COLUMNS if name in measured]
-    rows = [[arm, *(COLUMNS[c](of, c) for c in columns)] for arm, of in sorted(found.items())]
+    rows = [
+        [arm, *(float(np.mean([row[name] for row in of])) for name in columns)]
+        for arm, of in sorted(found.items())
+    ]
     table = [*rows, *_means("mean of all arms", rows)]
     table += _means(f"mean of {', '.join(FOUR)}", [row for row in rows if row[0] in FOUR])
     print(tabulate(table, ["arm", *columns], floatfmt=".3f"))
@@ -207,19 +191,11 @@ def _measure(task: Task, *, solid_name: str, fits: Sequence[str], peer: bool) ->
     row = {"iou trimesh": quality(solid, [_tightest(solid)]).iou}
     if peer:
         shape, seconds = _timed(lambda: _scikit_robot(solid))
-        worth = quality(solid, [shape])
-        row |= {
-            "iou skrobot": worth.iou,
-            "volume skrobot": worth.volume_ratio,
-            "coverage skrobot": worth.coverage,
-            "s skrobot": seconds,
-        }
+        row |= {"iou skrobot": quality(solid, [shape]).iou, "s skrobot": seconds}
     for name in fits:
         fit, seconds = _timed(partial(fit_solid, solid, FITS[name]))
         row |= {
             f"iou {name}": fit.quality.iou,
-            f"volume {name}": fit.quality.volume_ratio,
-            f"coverage {name}": fit.quality.coverage,
             f"n {name}": float(len(fit.primitives)),
             f"s {name}": seconds,
         }
@@ -266,10 +242,6 @@ def _scikit_robot(solid: Solid) -> Shape:
 def _timed(fit: Callable[[], T]) -> tuple[T, float]:
     start = time.process_time()
     return fit(), time.process_time() - start
-
-
-def _mean(rows: Sequence[Row], key: str) -> float:
-    return float(np.mean([row[key] for row in rows]))
 
 
 def _means(label: str, rows: Sequence[list[Any]]) -> list[list[Any]]:

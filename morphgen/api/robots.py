@@ -191,7 +191,6 @@ def fit(
     *,
     max_primitives: int = 1,
     iou: float = 0.9,
-    enclose: bool = False,
     spheres: int | None = None,
     cover: float | None = None,
     visual: bool = False,
@@ -213,7 +212,6 @@ def fit(
             file, which becomes a robot of one link.
         max_primitives: Largest number of primitives per link, 1 to 32.
         iou: Use the fewest primitives that reach this intersection over union.
-        enclose: Enclose every point of a link, for conservative collision checks.
         spheres: Number of spheres per link, 1 to 32, for a fit with spheres alone.
         cover: Share of a link's volume that its spheres must cover, such as 0.995; by default they
             have the largest intersection over union.
@@ -235,7 +233,7 @@ def fit(
     from morphgen.fitting.fitted_robot import fit_robot
     from morphgen.fitting.link_fit import FitOptions
 
-    options = FitOptions(max_primitives, iou, enclose, seed, spheres, cover)
+    options = FitOptions(max_primitives, iou, seed, spheres, cover)
     parts = default_library(library)
     if isinstance(robot, str | PathLike) and Path(robot).suffix.lower() in MESH_SUFFIXES:
         path = Path(robot)

@@ -14,7 +14,6 @@ import scipy  # loads its packages at their first use, which take seconds
 
 from morphgen.model.geometry import Box, Capsule, Cylinder, Pose, Shape, Sphere
 from morphgen.model.rotation import IDENTITY, Quat, normalize, unit_quaternion, vec3
-from morphgen.typing import Array
 
 Kind = Literal["box", "cylinder", "sphere"]  # a kind of primitive that the fitter chooses from
 KINDS: tuple[Kind, ...] = ("box", "cylinder", "sphere")
@@ -32,41 +31,32 @@ _BOX_SYMMETRIES = np.array(
 
 
 def canonical(shape: Shape) -> Shape:
-    """Return the same primitive in its canonical pose; a mesh is returned unchanged."""
+    """Return the same primitive in its canonical pose; a mesh is returned unchanged.
+
+    A cylinder's rotation takes z to its axis, pointing above the xy plane; a box's is that of its
+    24 rotations nearest to the link's axes.
+    """
     geometry, pose = shape.geometry, shape.T_link_shape
     R = pose.matrix[:3, :3]
     match geometry:
         case Sphere():
             quaternion = IDENTITY
         case Cylinder() | Capsule():
-            quaternion = least_rotation("cylinder", R)
+            x, y, z = R[:, 2].tolist()
+            if tuple(R[::-1, 2].round(_DECIMALS)) < (0.0, 0.0, 0.0):
+                x, y, z = -x, -y, -z
+            quaternion = normalize((1 + z, -y, x, 0.0))  # the shortest rotation from z to the axis
         case Box(edges):
-            quaternion = least_rotation("box", R)
+            rotations = R @ _BOX_SYMMETRIES
+            # The trace of a rotation is 1 + 2 cos(angle).
+            traces = np.trace(rotations, axis1=1, axis2=2).round(_DECIMALS)
+            best = scipy.spatial.transform.Rotation.from_matrix(rotations[np.argmax(traces)])
+            quaternion = unit_quaternion(best.as_quat(scalar_first=True).tolist())
             R_canonical_old = Pose(quaternion=quaternion).matrix[:3, :3].T @ R
             geometry = Box(vec3((np.abs(R_canonical_old.round()) @ edges).tolist()))
         case _:
             return shape
     return replace(shape, geometry=geometry, T_link_shape=Pose(pose.position, quaternion))
-
-
-def least_rotation(kind: Kind, R: Array) -> Quat:
-    """Return the rotation of the smallest angle among those that leave a primitive the same.
-
-    A cylinder's takes z to its axis, pointing above the xy plane; a box's is that of its 24
-    rotations nearest to the link's axes.
-    """
-    if kind == "sphere":
-        return IDENTITY
-    if kind == "box":
-        rotations = R @ _BOX_SYMMETRIES
-        # The trace of a rotation is 1 + 2 cos(angle).
-        traces = np.trace(rotations, axis1=1, axis2=2).round(_DECIMALS)
-        best = scipy.spatial.transform.Rotation.from_matrix(rotations[np.argmax(traces)])
-        return unit_quaternion(best.as_quat(scalar_first=True).tolist())
-    x, y, z = R[:, 2].tolist()
-    if tuple(R[::-1, 2].round(_DECIMALS)) < (0.0, 0.0, 0.0):
-        x, y, z = -x, -y, -z
-    return normalize((1 + z, -y, x, 0.0))  # the shortest rotation from z to the axis
 
 
 def rounded(quaternion: Quat) -> Quat:

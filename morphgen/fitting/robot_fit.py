@@ -215,7 +215,7 @@ class FitReport:
     def as_dict(self) -> dict[str, object]:
         """Return plain data for JSON."""
         options = self.options
-        of_spheres, of_primitives = ("spheres", "cover"), ("max_primitives", "iou", "enclose")
+        of_spheres, of_primitives = ("spheres", "cover"), ("max_primitives", "iou")
         names = of_primitives if options.spheres is None else of_spheres
         return {
             "robot": self.robot,

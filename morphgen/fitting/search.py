@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import trimesh
@@ -346,11 +345,6 @@ class SampledSolid(Cloud):
     solid: Solid
     R_link_box: Array  # axes of the smallest bounding box in the link frame, shape (3, 3)
     centre: Array  # centre of the smallest bounding box in the link frame [m], shape (3,)
-
-    @cached_property
-    def link_points(self) -> Array:
-        """The points in the link frame [m]."""
-        return np.asarray(self.points * self.solid.size @ self.R_link_box.T + self.centre)
 
     def shapes(self, candidates: Candidates, row: int) -> tuple[Shape, ...]:
         """Return one candidate as rounded shapes in the link frame."""

@@ -322,18 +322,20 @@ def _openness(rays: RayMeshIntersector, points: Array) -> Array:
     """
     if not len(points):
         return np.zeros(0)
-    directions = spiral(1 - 2 * (np.arange(NUM_RAYS) + 0.5) / NUM_RAYS, 0.5)
+    directions = _directions()
     hits = rays.intersects_any(
         np.repeat(points, NUM_RAYS, axis=0), np.tile(directions, (len(points), 1))
     )
     return np.asarray(1 - hits.reshape(len(points), NUM_RAYS).mean(axis=1))
 
 
-def spiral(z: Array, start: float = 0.0) -> Array:
-    """Return the directions (n, 3) of a Fibonacci lattice on the sphere, by their heights (n,).
+def _directions() -> Array:
+    """Return the directions of rays, (NUM_RAYS, 3): a Fibonacci lattice on the sphere.
 
     Equal steps along z cut zones of equal area; the golden angle spreads them around z.
     """
-    turn = np.pi * (1 + np.sqrt(5)) * (np.arange(len(z)) + start)  # multiples of the golden angle
+    steps = np.arange(NUM_RAYS) + 0.5
+    z = 1 - 2 * steps / NUM_RAYS
+    turn = np.pi * (1 + np.sqrt(5)) * steps  # multiples of the golden angle
     radius = np.sqrt(1 - z * z)
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)

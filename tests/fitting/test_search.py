@@ -1,6 +1,5 @@
-"""Search for primitives: enclosing ones, spheres, their quality."""
+"""Search for primitives: boxes, cylinders, spheres, their quality."""
 
-import itertools
 import math
 import os
 from dataclasses import replace
@@ -9,20 +8,17 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.integrate import dblquad
-from scipy.spatial.transform import Rotation
 
 from helpers.commands import run_python
 from helpers.robots import arm
 from morphgen.errors import FitError, FormatError
 from morphgen.fitting import search
 from morphgen.fitting.canonical import KINDS
-from morphgen.fitting.link_fit import FitOptions, enclose, fit_shapes
+from morphgen.fitting.link_fit import FitOptions, fit_shapes
 from morphgen.fitting.quality import quality, signed_distance
 from morphgen.fitting.replace_collision import as_spheres, has_only_spheres, link_spheres
 from morphgen.fitting.solid import solid_of, solid_of_mesh
 from morphgen.fitting.token_shapes import token_shapes
-from morphgen.grammar.library import default_library
-from morphgen.grammar.part import load_part
 from morphgen.model.geometry import (
     IDENTITY,
     Box,
@@ -33,7 +29,6 @@ from morphgen.model.geometry import (
     Shape,
     Sphere,
     dimensions,
-    volume,
 )
 from morphgen.model.inertia import solid_mesh
 
@@ -174,166 +169,6 @@ def test_a_point_at_the_centre_has_finite_gradients(kind):
     assert (moved.halves > 0).all()
 
 
-GEOMETRY = {"box": Box, "cylinder": Cylinder, "sphere": Sphere}
-CUBE = np.array(list(itertools.product((0.0, 0.1), repeat=3)))
-ROUNDING = 1.001
-
-
-def outside(shape, points):
-    """Return the largest signed distance of points to a shape [m]."""
-    return float(signed_distance([shape], points).max())
-
-
-def surface(kind, rng):
-    """Points of a randomly placed primitive of random size, and its volume."""
-    a, b, c = np.exp(rng.uniform(-3, -0.5, 3)).tolist()
-    geometry = {"box": Box((a, b, c)), "cylinder": Cylinder(a, b), "sphere": Sphere(a)}[kind]
-    turn = Rotation.from_rotvec(rng.uniform(-3, 3, 3)).as_matrix()
-    points = solid_mesh(geometry).subdivide().vertices @ turn.T + rng.uniform(-1, 1, 3)
-    return points, volume(geometry)
-
-
-def cloud(rng, n=40):
-    stretched = rng.normal(size=(n, 3)) * np.exp(rng.uniform(-3, 0, 3))
-    turn = Rotation.from_rotvec(rng.uniform(-3, 3, 3)).as_matrix()
-    return np.asarray(stretched @ turn.T + rng.uniform(-2, 2, 3))
-
-
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_turned_primitive_is_recovered(kind, seed):
-    points, truth = surface(kind, np.random.default_rng(seed))
-    shape = enclose(points)
-    assert isinstance(shape.geometry, GEOMETRY[kind])
-    assert volume(shape.geometry) == pytest.approx(truth, rel=5e-3)
-    assert outside(shape, points) <= 1e-9
-
-
-def test_a_primitive_aligned_with_the_link_axes_stays_aligned():
-    centre = np.array([0.5, 0.0, -0.2])
-    fit = enclose(np.asarray(trimesh.creation.box((0.1, 0.2, 0.3)).vertices) + centre, ["box"])
-    assert fit == box((0.1, 0.2, 0.3), at(0.5, 0.0, -0.2))
-    points = np.asarray(trimesh.creation.box((0.1, 0.2, 0.3)).subdivide().vertices)
-    noise = np.random.default_rng(0).uniform(-1e-7, 1e-7, points.shape)
-    assert enclose(points + noise, ["box"]).T_link_shape.quaternion == (1.0, 0.0, 0.0, 0.0)
-
-    upright = np.asarray(trimesh.creation.cylinder(0.1, 0.5).vertices)
-    cylinder = enclose(upright + centre, ["cylinder"])
-    assert cylinder == Shape(Cylinder(0.1, 0.5), fit.T_link_shape)
-    half = math.sqrt(0.5)
-    lying = enclose(upright[:, [2, 0, 1]] + centre, ["cylinder"])
-    assert lying.geometry == Cylinder(0.1, 0.5)
-    assert lying.T_link_shape.quaternion == pytest.approx((half, 0.0, half, 0.0))
-
-    ball = np.asarray(trimesh.creation.icosphere(2, 0.1).vertices) + centre
-    assert enclose(ball, ["sphere"]) == Shape(Sphere(0.1), fit.T_link_shape)
-
-
-@pytest.mark.parametrize(("seed", "scale"), [(0, 1.0), (3, 1e-4)])
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_encloses_all_points_after_rounding(kind, seed, scale):
-    points = scale * cloud(np.random.default_rng(seed))
-    shape = enclose(points, [kind])
-    assert isinstance(shape.geometry, GEOMETRY[kind])
-    assert outside(shape, points) <= 1e-9
-    assert outside(shape, points) > -3e-6, "a point must touch it"
-    pose = shape.T_link_shape
-    for value in (*dimensions(shape.geometry), *pose.position):
-        assert value == round(value, 6)
-    assert np.linalg.norm(pose.quaternion) == pytest.approx(1.0, abs=1e-15)
-    assert pose.quaternion == pytest.approx(np.round(pose.quaternion, 9), abs=2e-9)
-    assert pose.quaternion[0] >= 0
-
-
-def test_the_enclosure_of_a_link_is_not_larger_than_those_of_trimesh():
-    arm = load_part(default_library(()).manifest("panda")).fragment
-    # The cylinder that trimesh finds for it is a sixth too large.
-    mesh = solid_of(arm.link("panda_link3").collisions).mesh
-    _, extents = trimesh.bounds.oriented_bounds(mesh)
-    cylinder = trimesh.bounds.minimum_cylinder(mesh)
-    _, radius = trimesh.nsphere.minimum_nsphere(mesh)
-    rivals = (Box(tuple(extents)), Cylinder(cylinder["radius"], cylinder["height"]))
-    tightest = min(map(volume, (*rivals, Sphere(radius))))
-    shape = enclose(mesh.vertices)
-    assert volume(shape.geometry) <= tightest * ROUNDING
-    assert outside(shape, np.asarray(mesh.vertices)) <= 1e-9
-
-
-def test_the_smallest_box_of_a_regular_tetrahedron_is_a_cube():
-    corners = CUBE[[0, 3, 5, 6]]
-    turn = Rotation.from_rotvec([0.3, 1.1, -0.4]).as_matrix()
-    box = enclose(corners @ turn.T, ["box"]).geometry
-    assert volume(box) == pytest.approx(1e-3, rel=1e-3)
-    sphere = enclose(corners @ turn.T, ["sphere"]).geometry
-    assert sphere.radius == pytest.approx(0.05 * math.sqrt(3), abs=2e-6)
-
-
-def smallest_sphere(points):
-    """Return the radius by enumerating all spheres through two to four points."""
-    radii = []
-    for n in (2, 3, 4):
-        for some in itertools.combinations(range(len(points)), n):
-            spokes = points[list(some[1:])] - points[some[0]]
-            weights = np.linalg.lstsq(spokes @ spokes.T, (spokes**2).sum(axis=1) / 2, rcond=None)[0]
-            centre = points[some[0]] + weights @ spokes
-            radii.append(np.linalg.norm(points - centre, axis=1).max())
-    return float(min(radii))
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_the_sphere_is_the_minimum_enclosing_sphere(seed):
-    rng = np.random.default_rng(seed)
-    points = rng.normal(size=(8, 3))
-    if seed % 3 == 1:
-        points = points.round()
-    if seed % 3 == 2:
-        points /= np.linalg.norm(points, axis=1, keepdims=True)
-    sphere = enclose(points, ["sphere"]).geometry
-    assert sphere.radius == pytest.approx(smallest_sphere(points), abs=3e-6)
-
-
-def test_the_smallest_of_several_kinds_is_returned():
-    points = cloud(np.random.default_rng(7))
-    alone = {kind: enclose(points, [kind]) for kind in KINDS}
-    for kinds in (KINDS, ("sphere", "box")):
-        smallest = min((alone[kind] for kind in kinds), key=lambda s: volume(s.geometry))
-        assert enclose(points, kinds) == smallest
-
-
-def test_the_result_is_deterministic_and_independent_of_interior_points():
-    rng = np.random.default_rng(8)
-    points = cloud(rng)
-    inner = rng.dirichlet(np.ones(len(points)), 500) @ points
-    assert enclose(np.concatenate([points, inner, points])) == enclose(points)
-
-
-def test_a_dense_round_hull_is_enclosed_tightly():
-    egg = np.asarray(trimesh.creation.icosphere(5).vertices) * (0.3, 0.2, 0.1)
-    assert len(egg) > 10_000
-    turn = Rotation.from_rotvec([0.5, 0.2, 1.0]).as_matrix()
-    shape = enclose(egg @ turn.T, ["box"])
-    assert outside(shape, egg @ turn.T) <= 1e-9
-    assert volume(shape.geometry) <= 0.6 * 0.4 * 0.2 * ROUNDING
-
-
-@pytest.mark.parametrize(
-    ("points", "reason"),
-    [
-        (np.zeros((0, 3)), "0 points"),
-        (np.ones((9, 3)), "1 points are distinct"),
-        (np.eye(3)[[0, 1, 2, 0, 1, 2]], "3 points are distinct"),
-        (np.stack([np.arange(5.0)] * 3, axis=1), "flat"),
-        (np.insert(np.random.default_rng(0).normal(size=(50, 2)), 1, 3.0, axis=1), "flat"),
-        (np.vstack([CUBE, [0.0, 0.0, np.nan]]), "not finite"),
-    ],
-)
-def test_points_without_volume_are_an_error(points, reason):
-    with pytest.raises(FitError, match=reason):
-        enclose(points)
-    with pytest.raises(ValueError, match=r"\(8, 2\); expected \(n, 3\)"):
-        enclose(CUBE[:, :2])
-
-
 BALLS = ((0.1, 0.0, 0.0, 0.05), (-0.02, 0.03, 0.0, 0.07), (0.0, -0.04, 0.1, 0.04))
 BOX = (0.3, 0.1, 0.08)
 BEST_GRID = 2.01  # volume ratio of eight equal balls on the best grid that cover the box
@@ -389,7 +224,7 @@ def test_protruding_share_of_a_ball_around_a_cube():
     ("options", "message"),
     [
         ({"spheres": 0}, "0 spheres: expected 1 to 32"),
-        ({"spheres": 4, "enclose": True}, "neither max_primitives nor enclose"),
+        ({"spheres": 4, "max_primitives": 2}, "takes no max_primitives"),
         ({"cover": 0.9}, "cover 0.9: expected a number of spheres"),
         ({"spheres": 4, "cover": 1.0}, "cover 1: expected more than 0, at most 0.9999"),
         ({"spheres": 4, "cover": float("nan")}, "cover nan"),
