@@ -47,7 +47,7 @@ from morphgen.splits.split_file import find_split, read_split_file, split_names
 WORDS, DERIVATION, MEMBER, UPLOAD = "words:", "derivation:", "split:", "upload:"
 """Schemes of robot URIs; a URI without scheme is a path."""
 DEFAULT_WORDS = "arm=ur5 ee=plane"  # words of the robot that pages show when none is named
-EPISODE_SUFFIX, CHECKPOINT = ".npz", "checkpoint.pt"
+CHECKPOINT = "checkpoint.pt"
 _VERSION = version("morphgen")  # it takes longer to look up than the rest of a hash
 MAX_ERROR = 1000  # longest error that a page shows [characters]
 _TEMPORARY = re.compile(rf"{re.escape(tempfile.gettempdir())}/(tmp|morphgen-)[^/\s]*/?(robot/)?")

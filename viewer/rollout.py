@@ -35,7 +35,7 @@ class RolloutConfig:
 
 @dataclass(eq=False)
 class EpisodeSource:
-    """Source of an episode: a file, whose episode is complete, or a simulation."""
+    """Source of an episode: a recording, which is complete, or a simulation."""
 
     episode: Episode
     max_steps: int  # longest possible duration [control steps]

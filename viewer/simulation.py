@@ -38,7 +38,7 @@ from morphgen.tasks.scenes.env_specs import load_robot
 from morphgen.tasks.sim.articulated import ArticulatedObject
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Block
 from morphgen.viewer.app.address import MAX_PLAYED
-from morphgen.viewer.episode import BLOCK, Array, Episode, EpisodeError, Track
+from morphgen.viewer.episode import BLOCK, Array, Episode, Track
 from morphgen.viewer.robot_uri import (
     DEFAULT_WORDS,
     DERIVATION,
@@ -235,7 +235,7 @@ def recorded_episode(folder: str, index: int, files: FileAccess) -> Episode:
     recorded, batch = demos.episodes[index], demos.episode_batch(index)
     uri = f"{folder.rstrip('/')}/{BODIES}/{recorded.robot_hash}"
     if not (batch.q.isfinite().all() and batch.simulation.object_pose.isfinite().all()):
-        raise EpisodeError(f"{folder}: the states of episode {index} are not finite")
+        raise SimulationError(f"{folder}: the states of episode {index} are not finite")
     track, steps = _track(read_robot_uri(uri, files), uri, batch), recorded.length
     for env in (*range(1, steps), steps - 1):
         state = render_state(batch, env)

@@ -49,7 +49,6 @@ from morphgen.tasks.goals import split_goals
 from morphgen.tasks.goals.goal_sets import FOLDER, INDEX
 from morphgen.tasks.registry import SIMULATORS, TASKS
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP
-from morphgen.viewer import episode
 
 
 def by_name(entries):
@@ -323,7 +322,6 @@ FORMATS = {
     "episodes.csv.gz": "",
     "release.json": release.FORMAT,
     "eval --submission": submission.FORMAT,
-    ".npz": episode.FORMAT,
     lerobot.RECORDING: lerobot.FORMAT,
 }
 

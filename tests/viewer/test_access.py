@@ -2,7 +2,6 @@
 
 import base64
 import http.client
-import json
 import random
 import re
 import string
@@ -13,7 +12,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import msgspec
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -564,7 +562,7 @@ def secret(tmp_path):
     robot = f'<robot name="{WORD}"><link name="{WORD}"'
     contents = {"a.urdf": robot, "a.xacro": robot, "card.json": f'{{"{WORD}"'}
     contents |= {"a.grammar": f"robot -> {WORD} }}{WORD}\n", "a.yaml": f"{WORD}: {{{WORD}\n"}
-    contents |= dict.fromkeys(("checkpoint.pt", "a.npz", "index.jsonl"), WORD)
+    contents |= dict.fromkeys(("checkpoint.pt", "index.jsonl"), WORD)
     for name, content in contents.items():
         (folder / name).write_text(content)
     return folder
@@ -588,7 +586,6 @@ def secret(tmp_path):
         "?split={}/a.yaml",
         "?split={}",
         "?compare={}/a.urdf&compare={}/a.grammar",
-        "?play={}/a.npz",
         "?play=reach&policy={}/checkpoint.pt",
         "?play=reach&policy={}",
         "?play=&policy={}/a.yaml",
@@ -619,7 +616,6 @@ def test_url_reveals_nothing_outside_the_folders(shared_viewer, quiet, secret, q
         ("?gallery=%00", "no such file or folder"),
         ("?split=%00", "no such file or folder"),
         ("?compare=%00&compare=%00", "no such file or folder"),
-        ("?play=%00.npz", "no such file or folder"),
         ("?play=reach&policy=%00", "neither a checkpoint nor a policy"),
         ("?play=reach&policy=ikk", "did you mean 'ik'"),
         ("?robot=derivation:" + DEEP, "more than 100 parts"),
@@ -665,18 +661,6 @@ def test_checkpoint_cannot_name_an_outside_robot(files, folder, secret, monkeypa
         with pytest.raises(MorphgenError, match="outside of the folders") as refused:
             simulation.training_robots("runs/some.pt", files)
         assert WORD not in str(refused.value)
-
-
-def test_episode_cannot_name_an_outside_robot(shared_viewer, folder, secret):
-    body = {"name": "a", "place": f"{secret}/a.urdf", "body": "", "ground": None}
-    body |= {"obstacles": [], "block": None, "markers": []}
-    about = {"format": 2, "morphgen": "", "task": "reach", "policy": "zero", "seed": 0}
-    about |= {"obstacles": False, "simulator": "mujoco", "period": 0.02, "bodies": [body]}
-    arrays = {f"0/{name}": np.zeros(1) for name in ("q", "score", "distance", "success", "goal")}
-    np.savez(folder / "mine.npz", about=np.array(json.dumps(about)), **arrays)
-    with PlainClient(shared_viewer.port, "?play=mine.npz") as client:
-        client.shows("outside of the folders")
-        assert WORD not in client.text
 
 
 def test_card_cannot_name_an_outside_file(shared_viewer, folder, secret):

@@ -10,12 +10,12 @@ import pytest
 
 import morphgen
 from helpers.pages import choose, field, press
-from morphgen.errors import FormatError
+from morphgen.errors import FormatError, SimulationError
 from morphgen.grammar.library import default_library
 from morphgen.rl.demonstrations.reader import at_links
 from morphgen.viewer.app.address import Address
 from morphgen.viewer.app.app import start_address
-from morphgen.viewer.episode import EpisodeError, episode_bytes, read_episode, score_until
+from morphgen.viewer.episode import score_until
 from morphgen.viewer.pages.play import curves
 from morphgen.viewer.robot_uri import FileAccess, UriError
 from morphgen.viewer.rollout import RolloutConfig
@@ -70,12 +70,6 @@ def test_a_recorded_episode_is_the_rollout_of_its_actions(index, files):
     assert [len(data) for data in curves(recorded, n)] == [3, 3, 3]  # with one of rewards
 
 
-def test_a_recorded_episode_is_saved_as_any_other(files, root):
-    content = episode_bytes(recorded_episode("demos", 1, files))
-    (root / "saved.npz").write_bytes(content)
-    assert episode_bytes(read_episode(root / "saved.npz", files)) == content
-
-
 def test_the_folder_opens_the_page(files):
     robots, episodes = list_episodes("demos", files)
     assert [name for name, _ in robots] == ["arm3-stick"]
@@ -107,7 +101,7 @@ def test_states_that_are_not_finite_are_refused(files, root):
     values = pa.FixedSizeListArray.from_arrays(pa.array(state.reshape(-1)), state.shape[1])
     number = table.column_names.index("observation.state")
     pq.write_table(table.set_column(number, "observation.state", values), path)
-    with pytest.raises(EpisodeError, match="damaged: the states of episode 0 are not finite"):
+    with pytest.raises(SimulationError, match="damaged: the states of episode 0 are not finite"):
         recorded_episode("damaged", 0, files)
 
 

@@ -238,11 +238,6 @@ def start_address(words: Sequence[str], files: robot_uri.FileAccess) -> Address:
 
 def _path_address(text: str, files: robot_uri.FileAccess) -> Address:
     path = files.path(text)
-    if path.suffix == robot_uri.EPISODE_SUFFIX:
-        from morphgen.viewer.episode import read_episode
-
-        read_episode(path, files)
-        return Address("play", (text,))
     if path.suffix == ".pt" or (path / robot_uri.CHECKPOINT).is_file():
         from morphgen.rl.runs.checkpoint import read_checkpoint
 

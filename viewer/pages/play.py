@@ -1,4 +1,4 @@
-"""The page of a rollout: robots at a task, simulated now or played back from a file."""
+"""The page of a rollout: robots at a task, simulated now."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from morphgen.viewer.app.address import MAX_PLAYED, Address, AddressError
 from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.app.workers import named
 from morphgen.viewer.controls import RobotPicker, Robots, bind, robot_lists
-from morphgen.viewer.episode import Episode, episode_bytes, read_episode, score_until, snapshot
-from morphgen.viewer.robot_uri import DEFAULT_WORDS, EPISODE_SUFFIX, WORDS, FileAccess, uri_name
+from morphgen.viewer.episode import Episode, score_until, snapshot
+from morphgen.viewer.robot_uri import DEFAULT_WORDS, WORDS, FileAccess, uri_name
 from morphgen.viewer.scene.rollout import RolloutScene, add_episode, episode_page, show_step
 from morphgen.viewer.scene.stage import look_at
 
@@ -44,19 +44,11 @@ def show(session: Session) -> None:
         return
     header = markup.breadcrumbs((uri_name(subject) or "play", None))
     session.open_panel(PANEL_WIDTH, header, "reading")
-    if subject.endswith(EPISODE_SUFFIX):
-        episode = read_episode(session.files.path(subject), session.files)
-        page = PlayPage(session)
-        session.client.gui.add_html(markup.framed(describe_episode(episode)))
-        session.title = f"play {uri_name(subject)}"
-        session.apply_state()
-        page.load(lambda: rollout.EpisodeSource(episode, episode.num_steps))
-    else:
-        trained_on = complete_address(session)
-        if (task := session.address.subject) not in TASKS:
-            raise MorphgenError(f"no task {task!r} to play{nearest(task, TASKS)}")
-        page = PlayPage(session)
-        page.add_rollout_controls(trained_on)
+    trained_on = complete_address(session)
+    if (task := session.address.subject) not in TASKS:
+        raise MorphgenError(f"no task {task!r} to play{nearest(task, TASKS)}")
+    page = PlayPage(session)
+    page.add_rollout_controls(trained_on)
     page.add_downloads()
 
 
@@ -192,7 +184,7 @@ class PlayPage:
         restart()
 
     def add_downloads(self) -> None:
-        """Add buttons that send the episode, as far as it is simulated, as a file or a film."""
+        """Add buttons that send the episode, as far as it is simulated, as a film or a page."""
         gui, session = self.session.client.gui, self.session
 
         def send(suffix: str, make: Callable[[Episode], bytes]) -> None:
@@ -206,7 +198,6 @@ class PlayPage:
 
         film = functools.partial(session.workers.call, named("morphgen.viewer.film:render_video"))
         downloads: tuple[tuple[str, str, Callable[[Episode], bytes]], ...] = (
-            (f"Save episode ({EPISODE_SUFFIX})", EPISODE_SUFFIX, episode_bytes),
             ("Film (.mp4)", ".mp4", film),
             (
                 "Web page (.html)",
