@@ -14,8 +14,8 @@ its own imports each file with the package's folder as root. The outcomes are:
 ``check_urdf`` (Debian package liburdfdom-tools) reads the refused URDF files; it cannot read xacro.
 The script lists the files that it accepts and morphgen refuses, each with the reason; --all lists
 every file that is not imported. With --conform, the loaders also read each file that is imported as
-it is: a table counts in how many files they differ from morphgen, and why. The exit code is 1 if
-any outcome is CRASHED or wrong.
+it is: a table counts in how many files they differ from morphgen. The exit code is 1 if any outcome
+is CRASHED or wrong.
 """
 
 from __future__ import annotations
@@ -57,7 +57,6 @@ PACKAGES = {
 }
 """Folder with the robots of each package."""
 TIMEOUT_S = 300
-AGREES, UNEXPLAINED = "agrees", "UNEXPLAINED: "
 _CHECKER = shutil.which("check_urdf")
 _FORK = multiprocessing.get_context("fork")
 _FRAGMENT = re.compile(r"<link|<xacro:(?!macro|include|property|arg)\w")
@@ -74,8 +73,7 @@ class Outcome:
     accepted: bool | None = None
     """Whether ``check_urdf`` accepts the file; None if it did not read it."""
     loaders: tuple[tuple[str, str], ...] = ()
-    """Each loader that read the file as it is, with every cause of its differences; ``AGREES`` if
-    there are none, or ``UNEXPLAINED`` and what differs."""
+    """Each loader that was given the file as it is, and its differences; empty without any."""
 
 
 def main() -> int:
@@ -161,7 +159,7 @@ def _import(answer: Connection, root: Path, path: Path, out: Path, conform: bool
 
 
 def _as_it_is(path: Path, root: Path) -> Iterator[tuple[str, str]]:
-    """Yield the loaders of a file and the causes of their differences; see ``Outcome.loaders``."""
+    """Yield the loaders of a file and their differences; see ``Outcome.loaders``."""
     try:
         rows = compare_file(path, default_finder(root=root), samples=20)
     except MorphgenError as error:  # it can be imported, but no loader may get it
@@ -169,9 +167,7 @@ def _as_it_is(path: Path, root: Path) -> Iterator[tuple[str, str]]:
         return
     for row in rows:
         if row.passed is not None:
-            unexplained = (UNEXPLAINED + row.message,) if row.is_unexplained else ()
-            for cause in (AGREES,) if row.passed else (*row.causes, *unexplained):
-                yield row.loader, cause
+            yield row.loader, row.message
 
 
 def _morphgen(words: list[str]) -> int:
@@ -222,23 +218,13 @@ def _print(outcomes: list[Outcome], *, everything: bool) -> None:
 
 
 def _print_loaders(outcomes: list[Outcome]) -> None:
-    """Print in how many files each loader agrees, and the files of each cause of a difference."""
-    found: dict[tuple[str, str], list[str]] = {}
-    for outcome in outcomes:
-        for loader, cause in outcome.loaders:
-            cause = UNEXPLAINED if cause.startswith(UNEXPLAINED) else cause
-            found.setdefault((loader, cause), []).append(outcome.file)
-    heads = ["loader", "the file as it is", "files", "such as"]
-    rows: list[tuple[str, str, int, str]] = [
-        (loader, cause.strip(": "), len(files), Path(min(files, key=len)).name)
-        for (loader, cause), files in found.items()
-    ]
-    rows.sort(key=lambda row: (row[0], row[1] != AGREES, -row[2]))
-    print(tabulate(rows, heads))
-    for outcome in outcomes:
-        for loader, cause in outcome.loaders:
-            if cause.startswith(UNEXPLAINED):
-                print(f"{outcome.package}: {outcome.file}: {loader}: {cause[:300]}")
+    """Print in how many files as they are each loader agrees and differs."""
+    read = [answer for outcome in outcomes for answer in outcome.loaders]
+    rows = []
+    for loader in sorted({loader for loader, _ in read}):
+        own = [difference for name, difference in read if name == loader]
+        rows.append([loader, len(own), own.count(""), len(own) - own.count("")])
+    print(tabulate(rows, ["loader", "files as they are", "agrees", "differs"]))
 
 
 if __name__ == "__main__":

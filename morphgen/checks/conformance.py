@@ -1,16 +1,13 @@
 """Conformance: compare how different loaders read a bundle, or a file as it is.
 
 The files of a bundle must be read alike by all loaders. A file of others need not be: each loader
-reads it as its own rules say. Such a row names the causes of its differences. A cause, a ``Quirk``,
-is tried: the loader must agree with morphgen's reading of the file that the cause has changed.
+reads it as its own rules say.
 """
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from copy import deepcopy
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from itertools import chain
@@ -18,25 +15,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lxml import etree
 
 from morphgen.arguments import whole_number
 from morphgen.checks.hold import HoldRow
 from morphgen.checks.readers import LOADERS, NO_LIMITS, Loader, Reading
-from morphgen.checks.rules import PYBULLET_LINKS
 from morphgen.errors import FormatError, one_line
 from morphgen.formats.bundle import URDF, read_bundle
 from morphgen.formats.description import read_description
 from morphgen.formats.gate import loader_copy
-from morphgen.formats.resolve import PackageFinder, default_finder
-from morphgen.formats.rounding import INERTIA_NAMES
-from morphgen.formats.urdf.read import robot_from_xml
+from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS
 from morphgen.model import kinematics
 from morphgen.model.dynamics import actuation, gravity_load, mass_matrix
-from morphgen.model.geometry import Pose
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Frame, Joint, Mimic, Robot
-from morphgen.model.rotation import unit_quaternion
 from morphgen.typing import Array
 
 POSITION_TOLERANCE = 1e-5  # largest accepted distance between a loader's tool and morphgen's [m]
@@ -93,13 +84,6 @@ class ConformanceRow:
     product of its two diagonal entries."""
     message: str = ""  # description of the disagreement, or `not installed`
     source: str = BUNDLE  # `bundle`, or `file` if the loader read the file of others as it is
-    causes: tuple[str, ...] = ()
-    """The deviations of the loader that explain all its differences from morphgen."""
-
-    @property
-    def is_unexplained(self) -> bool:
-        """Whether a difference has no known cause."""
-        return self.passed is False and not self.causes
 
 
 @dataclass(frozen=True)
@@ -111,8 +95,8 @@ class ConformanceReport:
     samples: int  # number of configurations
     seed: int  # seed of the configurations
     passed: bool
-    """Whether every installed loader agrees, or differs on a file of others with known causes, and,
-    if measured, the robot holds its home and steps from it."""
+    """Whether every installed loader agrees on the bundle and, if measured, the robot holds its
+    home and steps from it."""
     rows: tuple[ConformanceRow, ...]  # the loaders
     holds: tuple[HoldRow, ...] = ()
     """The simulators in which the robot holds its home configuration, and steps from it."""
@@ -141,8 +125,7 @@ def compare(robot: Robot, folder: Path, samples: int = 100, seed: int = 0) -> Co
         frame = Frame(robot.links[-1].name, robot.links[-1].name)
         robot = replace(robot, frames=(frame,))
     q = _configurations(robot, samples, seed)
-    read = (_row(loader, robot, folder, frame.name, q, has_gains=True) for loader in LOADERS)
-    rows = tuple(row for row, _ in read)
+    rows = tuple(_row(loader, robot, folder, frame.name, q, BUNDLE) for loader in LOADERS)
     passed = all(row.passed is not False for row in rows)
     return ConformanceReport(robot.name, frame.name, samples, seed, passed, rows)
 
@@ -159,22 +142,10 @@ def compare_file(
     moving = [joint.child for joint in robot.joints if joint.is_movable]
     robot = replace(robot, frames=tuple(Frame(link, link) for link in moving[-1:]))
     frame, q = "".join(moving[-1:]), _configurations(robot, samples, seed)
-    rows = []
     with loader_copy(path, finder) as folder:
         is_urdf = (folder / URDF).is_file()
-        for loader in LOADERS:
-            if (loader.file == URDF) is not is_urdf:
-                continue
-            row, reading = _row(loader, robot, folder, frame, q, has_gains=False)
-            if row.passed is False:
-                known = (folder, frame, _positions(robot, q))
-                if reading is None:
-                    causes = _refused(loader, row.message, *known)
-                else:
-                    causes = _differing(loader, reading, *known)
-                row = replace(row, causes=causes)
-            rows.append(replace(row, source=FILE))
-    return tuple(rows)
+        loaders = [loader for loader in LOADERS if (loader.file == URDF) is is_urdf]
+        return tuple(_row(loader, robot, folder, frame, q, FILE) for loader in loaders)
 
 
 def _configurations(robot: Robot, samples: int, seed: int) -> Array:
@@ -188,36 +159,23 @@ def _configurations(robot: Robot, samples: int, seed: int) -> Array:
     return np.clip(q, -MAX_POSITION, MAX_POSITION)
 
 
-def _positions(robot: Robot, q: Array) -> dict[str, Array]:
-    """Return the positions of every movable joint by name, shape (n,)."""
-    names = [robot.joints[k].name for k in robot.movable_joints]
-    return dict(zip(names, kinematics.movable_positions(robot, q).T, strict=True))
-
-
 def _row(
-    loader: Loader, robot: Robot, folder: Path, frame: str, q: Array, *, has_gains: bool
-) -> tuple[ConformanceRow, Reading | None]:
-    """Return a loader's row, and what it read unless it refused the file."""
+    loader: Loader, robot: Robot, folder: Path, frame: str, q: Array, source: str
+) -> ConformanceRow:
     if find_spec(loader.module) is None:
-        return ConformanceRow(loader.name, None, message="not installed"), None
-    reading = _read(loader, folder, frame, _positions(robot, q), len(q))
-    if isinstance(reading, str):
-        return ConformanceRow(loader.name, False, message=reading), None
-    if not has_gains:
-        reading = replace(reading, has_actuators=False)
-    return _compared(loader, robot, reading, frame, q), reading
-
-
-def _read(
-    loader: Loader, folder: Path, frame: str, positions: Mapping[str, Array], n: int
-) -> Reading | str:
-    """Return what a loader reads, or the message with which it refuses the file."""
+        return ConformanceRow(loader.name, None, message="not installed", source=source)
+    names = [robot.joints[k].name for k in robot.movable_joints]
+    positions = dict(zip(names, kinematics.movable_positions(robot, q).T, strict=True))
     try:
-        return loader.read(folder, frame, positions, n)
+        reading = loader.read(folder, frame, positions, len(q))
     except FormatError as error:
-        return str(error)
+        return ConformanceRow(loader.name, False, message=str(error), source=source)
     except Exception as error:  # whatever a library of others raises is its refusal
-        return f"{type(error).__name__}: {one_line(str(error))}"
+        message = f"{type(error).__name__}: {one_line(str(error))}"
+        return ConformanceRow(loader.name, False, message=message, source=source)
+    if source == FILE:  # only bundles have the gains of morphgen
+        reading = replace(reading, has_actuators=False)
+    return replace(_compared(loader, robot, reading, frame, q), source=source)
 
 
 def _compared(
@@ -409,302 +367,3 @@ def _added_inertia(robot: Robot, q: Array) -> float:
     count = len(robot.links) + len(robot.frames)
     inertia = BOUND_INERTIA + BOUND_MASS * max(1.0, 4 * size**2)
     return float(gains**2 * count * inertia)
-
-
-def _refused(
-    loader: Loader, message: str, folder: Path, frame: str, positions: Mapping[str, Array]
-) -> tuple[str, ...]:
-    """Return what a loader refuses in a file: without all of it, it reads the file."""
-    file = folder / loader.file
-    words: list[str] = []
-    text, first = file.read_bytes(), {name: q[:1] for name, q in positions.items()}
-    root, left = etree.fromstring(text), [*REFUSALS]
-    try:
-        while quirk := next((each for each in left if re.search(each.refusal, message)), None):
-            left.remove(quirk)
-            changed = deepcopy(root)
-            quirk.change(changed, file)
-            file.write_bytes(etree.tostring(changed))
-            result = _read(loader, folder, frame, first, 1)
-            if isinstance(result, Reading):
-                return (*words, quirk.words)
-            if not re.search(quirk.refusal, result):
-                words.append(quirk.words)
-                root, message = changed, result
-    finally:
-        file.write_bytes(text)
-    return ()
-
-
-def _differing(
-    loader: Loader, reading: Reading, folder: Path, frame: str, positions: Mapping[str, Array]
-) -> tuple[str, ...]:
-    """Return the fewest quirks of a loader that explain what it read; none if they do not."""
-    text, n = (folder / loader.file).read_bytes(), len(reading.T_root_frame)
-
-    def explain(quirks: Sequence[Quirk]) -> bool:
-        root = etree.fromstring(text)
-        try:
-            for quirk in quirks:
-                quirk.change(root, folder / loader.file)
-            robot = robot_from_xml(etree.tostring(root), folder / loader.file, default_finder())
-        except (FormatError, ValueError):
-            return False
-        robot = replace(robot, frames=(Frame(frame, frame),) if frame else ())
-        names = [robot.joints[k].name for k in robot.independent_joints]
-        q = np.array([positions[name] for name in names]).reshape(len(names), n).T
-        return bool(_compared(loader, robot, reading, frame, q).passed)
-
-    chosen = known = [quirk for quirk in QUIRKS if loader.name in quirk.loaders]
-    if not known or not explain(known):
-        return ()
-    for quirk in known:
-        fewer = [each for each in chosen if each is not quirk]
-        if explain(fewer):
-            chosen = fewer
-    return tuple(quirk.words for quirk in chosen)
-
-
-Change = Callable[[etree._Element, Path], None]
-"""Function of the root of a URDF, which it changes to what a loader reads, and of the file."""
-
-
-@dataclass(frozen=True)
-class Quirk:
-    """How loaders read a URDF otherwise than morphgen, or what they refuse in it."""
-
-    words: str  # description of the deviation
-    change: Change
-    """Changes a URDF so that morphgen reads it as the loaders do, or so that they read it."""
-    loaders: tuple[str, ...] = ()  # names of the loaders that read so
-    refusal: str = ""  # regular expression of the message with which a loader refuses the file
-
-
-QUIRKS: list[Quirk] = []
-"""All deviations of loaders from the URDF specification, in the order in which they are applied."""
-
-
-def _quirk(words: str, *loaders: str, refusal: str = "") -> Callable[[Change], Change]:
-    """Make a change of a URDF the test of a quirk."""
-
-    def register(change: Change) -> Change:
-        QUIRKS.append(Quirk(words, change, loaders, refusal))
-        return change
-
-    return register
-
-
-@_quirk("reads no quat_xyzw", "yourdfpy", "pybullet", "mujoco (urdf)", "usd")
-def _drop_quaternions(root: etree._Element, urdf: Path) -> None:
-    for origin in root.iter("origin"):
-        origin.attrib.pop("quat_xyzw", "")
-
-
-@_quirk("counts the inertia of links without mass", "pybullet", "pinocchio")
-def _count_massless(root: etree._Element, urdf: Path) -> None:
-    for mass in root.iterfind("link/inertial/mass"):
-        if float(mass.get("value") or 0) == 0:
-            mass.set("value", repr(BOUND_MASS))
-
-
-@_quirk("gives links without inertia 1 kg and 1 kg m^2", "pybullet")
-def _add_inertia(root: etree._Element, urdf: Path) -> None:
-    for link in root.iterfind("link"):
-        if link.find("inertial") is None and link.get("name") != "world":
-            _set_inertial(link, 1.0, np.eye(3))
-
-
-@_quirk("gives links without inertia that of their shapes, of 1000 kg/m^3", "mujoco (urdf)")
-def _add_solids(root: etree._Element, urdf: Path) -> None:
-    import mujoco
-
-    spec = mujoco.MjSpec.from_file(str(urdf))
-    spec.compiler.fusestatic = False
-    spec.compiler.boundmass, spec.compiler.boundinertia = BOUND_MASS, BOUND_INERTIA
-    model = spec.compile()
-    for link in root.iterfind("link"):
-        if link.find("inertial") is None and link.find("collision") is not None:
-            body = model.body(link.get("name", ""))
-            R = Pose(quaternion=unit_quaternion(body.iquat.tolist())).matrix[:3, :3]
-            inertia = R @ np.diag(body.inertia) @ R.T
-            _set_inertial(link, float(body.mass[0]), inertia, body.ipos.tolist())
-
-
-def _set_inertial(
-    link: etree._Element, mass: float, inertia: Array, com: Sequence[float] = (0, 0, 0)
-) -> None:
-    for old in link.findall("inertial"):
-        link.remove(old)
-    element = etree.SubElement(link, "inertial")
-    etree.SubElement(element, "origin", xyz=" ".join(map(repr, com)))
-    etree.SubElement(element, "mass", value=repr(mass))
-    values = inertia[np.triu_indices(3)].tolist()
-    etree.SubElement(element, "inertia", dict(zip(INERTIA_NAMES, map(repr, values), strict=True)))
-
-
-@_quirk("joins the base to the world, without its mass", "mujoco (urdf)")
-def _empty_base(root: etree._Element, urdf: Path) -> None:
-    """Remove the inertia of the root and of the links that are fixed to it."""
-    parents = {}
-    for joint in root.iterfind("joint"):
-        parent, child = (joint.find(end) for end in ("parent", "child"))
-        if joint.get("type") == "fixed" and parent is not None and child is not None:
-            parents[child.get("link")] = parent.get("link")
-        elif child is not None:
-            parents[child.get("link")] = None
-    for link in root.iterfind("link"):
-        name = link.get("name")
-        while name is not None and name in parents:
-            name = parents[name]
-        if name is not None:
-            for inertial in link.findall("inertial"):
-                link.remove(inertial)
-
-
-def _set_inertias(
-    root: etree._Element, is_wrong: Callable[[float, float, float], bool], moment: str
-) -> None:
-    """Set the moments of inertia that are wrong; they are tested in ascending order."""
-    for inertia in root.iterfind("link/inertial/inertia"):
-        xx, xy, xz, yy, yz, zz = (float(inertia.get(name) or 0) for name in INERTIA_NAMES)
-        a, b, c = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).tolist()
-        if is_wrong(a, b, c):
-            for name in INERTIA_NAMES:
-                # The names of the diagonal are ixx, iyy and izz.
-                inertia.set(name, moment if name[1] == name[2] else "0")
-
-
-@_quirk("sets inertia that no body has to zero", "pybullet")
-def _zero_impossible(root: etree._Element, urdf: Path) -> None:
-    _set_inertias(root, lambda a, b, c: a < 0 or c > a + b, "0")
-
-
-@_quirk("limits continuous joints that name a range", "pybullet")
-def _limit_continuous(root: etree._Element, urdf: Path) -> None:
-    for joint in root.iterfind("joint[@type='continuous']"):
-        limit = joint.find("limit")
-        if limit is not None and {"lower", "upper"} & set(limit.attrib):
-            joint.set("type", "revolute")
-
-
-def _open_ranges(root: etree._Element, is_open: Callable[[float, float], bool]) -> None:
-    for limit in root.iterfind("joint/limit"):
-        if is_open(*(float(limit.get(name) or 0) for name in ("lower", "upper"))):
-            for name in ("lower", "upper"):
-                limit.attrib.pop(name, "")
-
-
-@_quirk("reads a range in the wrong order as none", "pybullet", "mujoco (urdf)")
-def _open_inverted(root: etree._Element, urdf: Path) -> None:
-    _open_ranges(root, lambda lower, upper: lower > upper)
-
-
-@_quirk("reads a range of 0 to 0 as none", "mujoco (urdf)")
-def _open_empty(root: etree._Element, urdf: Path) -> None:
-    _open_ranges(root, lambda lower, upper: lower == upper == 0)
-
-
-@_quirk("reads a range that is missing as 0 to 0", "pinocchio", "usd")
-def _zero_ranges(root: etree._Element, urdf: Path) -> None:
-    for limit in root.iterfind("joint/limit"):
-        if not {"lower", "upper"} & set(limit.attrib):
-            limit.set("lower", "0")
-            limit.set("upper", "0")
-
-
-@_quirk("holds joints that mimic a missing one", "yourdfpy")
-def _hold_lost_followers(root: etree._Element, urdf: Path) -> None:
-    """Let joints that mimic a missing one follow a fixed one, and so stay."""
-    joints = {joint.get("name"): joint.get("type") for joint in root.iterfind("joint")}
-    fixed = next((name for name, kind in joints.items() if kind == "fixed"), None)
-    for mimic in root.iterfind("joint/mimic"):
-        if mimic.get("joint") not in joints and fixed is not None:
-            mimic.set("joint", fixed)
-
-
-MIN_VALUE = 1e-14
-"""Largest mass and moment of inertia that MuJoCo 4.0 takes for zero [kg or kg m^2]."""
-
-
-@_quirk("refuses moving links without mass or inertia", refusal="mass and inertia of moving bodies")
-def _add_mass(root: etree._Element, urdf: Path) -> None:
-    for link in root.iterfind("link"):
-        mass = link.find("inertial/mass")
-        if mass is None or float(mass.get("value") or 0) <= MIN_VALUE:
-            _set_inertial(link, 1.0, np.eye(3))
-    _set_inertias(root, lambda a, b, c: c <= MIN_VALUE, "1")
-
-
-@_quirk("refuses inertia that no body has", refusal=r"A \+ B >= C")
-def _correct_impossible(root: etree._Element, urdf: Path) -> None:
-    # Rounding may have passed a + b = c already.
-    _set_inertias(root, lambda a, b, c: a + b <= c * (1 + 1e-9), "1")
-
-
-@_quirk("refuses inertia that is not positive", refusal="must have positive eigenvalues")
-def _correct_negative(root: etree._Element, urdf: Path) -> None:
-    _set_inertias(root, lambda a, b, c: a <= MIN_VALUE, "1")
-
-
-@_quirk(
-    "refuses <inertial> without <inertia>",
-    refusal="missing element: 'inertia'|Cannot load URDF file",
-)
-def _add_missing_inertia(root: etree._Element, urdf: Path) -> None:
-    for inertial in root.iterfind("link/inertial"):
-        if inertial.find("inertia") is None:
-            etree.SubElement(inertial, "inertia", dict(zip(INERTIA_NAMES, "100101", strict=True)))
-
-
-@_quirk("refuses a repeated element", refusal="repeated element")
-def _take_first(root: etree._Element, urdf: Path) -> None:
-    for parent in (*root.iterfind("joint"), *root.iterfind("link/*")):
-        for name in {str(child.tag) for child in parent}:
-            for surplus in parent.findall(name)[1:]:
-                parent.remove(surplus)
-
-
-@_quirk(
-    "refuses a mesh scale of more than three numbers",
-    refusal="'scale' has too much data|mesh: scale: .* but 3 expected",
-)
-def _shorten_scales(root: etree._Element, urdf: Path) -> None:
-    for mesh in root.iter("mesh"):
-        mesh.set("scale", " ".join(mesh.get("scale", "1 1 1").split()[:3]))
-
-
-@_quirk("refuses shapes without a size", refusal=r"size \d must be positive")
-def _thicken(root: etree._Element, urdf: Path) -> None:
-    for shape in root.iterfind("link/*/geometry/*"):
-        for name in {"size", "radius", "length"} & set(shape.attrib):
-            sizes = [size if float(size) else "0.001" for size in shape.get(name, "").split()]
-            shape.set(name, " ".join(sizes))
-
-
-@_quirk(
-    f"fails on robots with more than {PYBULLET_LINKS} links",
-    refusal="Cannot load URDF file|getLinkState failed",
-)
-def _drop_links(root: etree._Element, urdf: Path) -> None:
-    """Remove links that are fixed to others and carry none, until 127 are left below the root."""
-    links = {link.get("name"): link for link in root.iterfind("link")}
-    for joint in reversed(root.findall("joint[@type='fixed']")):
-        parents = {parent.get("link") for parent in root.iterfind("joint/parent")}
-        child = joint.find("child")
-        name = None if child is None else child.get("link")
-        if len(root.findall("link")) > PYBULLET_LINKS + 1 and name not in parents and name in links:
-            root.remove(joint)
-            root.remove(links[name])
-
-
-@_quirk("refuses a joint that mimics a missing one", refusal="Mimic joint '.*' not found")
-def _drop_lost_mimics(root: etree._Element, urdf: Path) -> None:
-    joints = {joint.get("name") for joint in root.iterfind("joint")}
-    for joint in root.iterfind("joint"):
-        for mimic in joint.findall("mimic"):
-            if mimic.get("joint") not in joints:
-                joint.remove(mimic)
-
-
-REFUSALS = [quirk for quirk in QUIRKS if quirk.refusal]
-"""Causes of refusals; each is one only if the loader reads the file without it."""

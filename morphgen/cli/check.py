@@ -162,7 +162,7 @@ def _conformance_text(reports: Mapping[str, ConformanceReport]) -> str:
                         )
                     )
                     notes.append(f"{name}, {where}: {one_line(row.message)}"[:_MAX_NOTE])
-                notes += [f"    cause: {cause}"[:_MAX_NOTE] for cause in row.causes]
+                notes += [f"    cause: {cause}"[:_MAX_NOTE] for cause in getattr(row, "causes", ())]
         # In the style plain, the titles are not padded to more than 120 columns.
         lines = [list(row.values()) for row in rows]
         text = table(lines, ("robot", *columns), style="plain", last=("joint",)) if rows else ""
