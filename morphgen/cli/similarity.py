@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import csv
 import io
-import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import groupby
@@ -25,7 +24,6 @@ from morphgen.encoding.tokens import (
     LAYOUT,
     default_max_links,
     require_max_links,
-    robot_from_tokens,
     tokens_npz,
 )
 from morphgen.encoding.tokens import tokens as encode
@@ -34,7 +32,6 @@ from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.files import require_writable_file, write_file
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
-from morphgen.model.geometry import Box, Cylinder, Shape, Sphere
 from morphgen.model.robot import Robot
 from morphgen.progress import part_of
 from morphgen.tables import fits, fitted, is_whole, table
@@ -190,12 +187,6 @@ def _csv(names: Sequence[str], matrices: dict[str, Array], groups: Sequence[str]
     return text.getvalue().encode()
 
 
-HEADERS = (
-    *("#", "link", "parent", "tool", "geometry (m)", "joint", "axis"),
-    *("origin xyz (m)", "origin rpy (deg)", "q scaled"),
-)
-
-
 def tokens(args: argparse.Namespace) -> None:
     """Print the tokens of the robots, or write those of one."""
     if not args.words:
@@ -220,9 +211,8 @@ def tokens(args: argparse.Namespace) -> None:
         data[0]["file"] = str(args.out)
 
     def text() -> str:
-        lines = [_tokens_text(*pair, max_links) for pair in zip(robots, tables, strict=True)]
-        if args.layout:
-            lines.append(f"\n{_layout_text()}")
+        lines = [f"{robot.name}: tokens {t.shape}" for robot, t in zip(robots, tables, strict=True)]
+        lines.append(f"\n{_layout_text()}" if args.layout else "tokens --layout has the fields")
         return "\n".join([*lines, str(args.out)] if args.out else lines)
 
     opt.print_result(args, data[0] if len(data) == 1 else data, text)
@@ -237,49 +227,6 @@ def _data(robot: Robot, tokens: Array, max_links: int) -> dict[str, object]:
         "layout": _layout_data(),
         "tokens": tokens.tolist(),
     }
-
-
-def _tokens_text(robot: Robot, tokens: Array, max_links: int) -> str:
-    """Return a table with a row per link, decoded from the tokens."""
-    decoded, shapes = robot_from_tokens(tokens, robot.name, max_links=max_links)
-    home = dict(zip(decoded.independent_joints, decoded.home, strict=True))
-    tools = {frame.link for frame in decoded.frames}
-    rows = []
-    for i, link in enumerate(decoded.links):
-        joint = decoded.joints[i - 1] if i else None
-        pose = joint.T_parent_joint if joint else None
-        rows.append(
-            (
-                i,
-                robot.links[i].name,
-                decoded.parents[i] if joint else "",
-                "tool" if link.name in tools else "",
-                _geometry_text(shapes.get(link.name)),
-                joint.kind if joint else "",
-                _numbers(joint.axis) if joint and joint.is_movable else "",
-                _numbers(pose.position, 4) if pose else "",
-                _numbers([math.degrees(angle) for angle in pose.rpy], 4) if pose else "",
-                f"{home[i - 1] + 0.0:.3f}" if i - 1 in home else "",
-            )
-        )
-    return f"{table(rows, HEADERS)}\n{robot.name}: {tokens.shape}, indices over {max_links - 1}"
-
-
-def _geometry_text(shape: Shape | None) -> str:
-    match shape.geometry if shape else None:
-        case Box(edges):
-            return f"box {' x '.join(f'{edge:.3g}' for edge in edges)}"
-        case Cylinder(radius, length):
-            return f"cylinder r {radius:.3g}, length {length:.3g}"
-        case Sphere(radius):
-            return f"sphere r {radius:.3g}"
-        case _:
-            return ""
-
-
-def _numbers(values: Sequence[float], digits: int = 3) -> str:
-    """Return numbers as text; adding 0.0 turns -0 into 0."""
-    return " ".join(f"{round(value, digits) + 0.0:g}" for value in values)
 
 
 def _layout_text() -> str:

@@ -1,4 +1,4 @@
-"""Tokens: encode a robot as 48 numbers per link, and decode it."""
+"""Tokens: encode a robot as 48 numbers per link."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from morphgen.arguments import whole_number
-from morphgen.errors import BenchmarkError, RobotError, nearest
+from morphgen.errors import BenchmarkError, nearest
 from morphgen.formats.rounding import as_written
 from morphgen.model import rotation
 from morphgen.model.geometry import IDENTITY, Box, Capsule, Cylinder, Geometry, Pose, Shape, Sphere
 from morphgen.model.kinematics import movable_positions
-from morphgen.model.robot import TOOL, Frame, Joint, JointKind, Link, Robot
+from morphgen.model.robot import Joint, JointKind, Robot
 from morphgen.typing import Array
 
 TOKEN_SIZE = 48
@@ -25,7 +25,7 @@ MAX_LINKS = 23  # number of links of the paper's largest robot: 22 and the base
 LARGEST_MAX_LINKS = 10_000
 """Largest ``max_links``: a robot's tokens have as many rows, so a larger one fills the memory."""
 TOLERANCE = 1e-4
-"""Largest error of a number that is still decoded; single-precision tokens are within it."""
+"""Largest difference of numbers of tokens that are the same; of single precision is less."""
 
 SHAPES = ("sphere", "cylinder", "box")  # order of the one-hot encoding of a geometry
 KINDS: tuple[JointKind, ...] = ("prismatic", "revolute", "fixed")
@@ -140,12 +140,6 @@ def encode_position(x: Array) -> Array:
     return np.concatenate([np.sin(angles), np.cos(angles)], axis=-1)
 
 
-def decode_position(numbers: Array) -> float:
-    """Decode the 16 numbers of ``joint position`` to a normalized position in [-2, 2]."""
-    # The lowest frequency is the only one that is unique over [-2, 2].
-    return math.atan2(numbers[0], numbers[len(FREQUENCIES)]) / (math.pi / 2)
-
-
 def encode_primitive(geometry: Geometry) -> tuple[float, ...]:
     """Encode a primitive; a capsule becomes the cylinder of its total length."""
     match geometry:
@@ -161,7 +155,8 @@ def encode_primitive(geometry: Geometry) -> tuple[float, ...]:
             raise ValueError(
                 "a mesh has no token; morphgen.fitting.token_shapes.token_shapes gives primitives"
             )
-    _require_sizes(sizes)
+    if not all(0 < size < math.inf for size in sizes):
+        raise ValueError(f"sizes {_format(sizes)} are not all positive and finite")
     return (*_one_hot(kind, SHAPES), *sizes)
 
 
@@ -172,11 +167,6 @@ def encode_pose(pose: Pose) -> tuple[float, ...]:
 
 def _one_hot(name: str, names: Sequence[str]) -> tuple[float, ...]:
     return tuple(float(name == other) for other in names)
-
-
-def _require_sizes(sizes: Sequence[float]) -> None:
-    if not all(0 < size < math.inf for size in sizes):
-        raise ValueError(f"sizes {_format(sizes)} are not all positive and finite")
 
 
 def _format(numbers: Sequence[float]) -> str:
@@ -262,72 +252,6 @@ def normalize_positions(robot: Robot, q: ArrayLike) -> Array:
     return np.asarray(centred / half_range)
 
 
-def robot_from_tokens(
-    tokens: ArrayLike, name: str, *, max_links: int = MAX_LINKS
-) -> tuple[Robot, dict[str, Shape]]:
-    """Decode tokens (n_links, 48) and return the robot and its primitives by link name.
-
-    Links are named ``link0``, ``link1`` ..., and joints ``joint1`` ... after their child links.
-    Movable joints have limits (-1, 1), so that q is the normalized position; the home is that of
-    the tokens.
-    """
-    table = np.asarray(tokens, dtype=np.float64)
-    what = f"tokens of {name!r}"
-    if table.ndim != 2 or table.shape[1] != TOKEN_SIZE or not len(table):
-        raise BenchmarkError(f"{what}: shape {table.shape}; expected (n_links, {TOKEN_SIZE})")
-    require_max_links(len(table), what, max_links)
-    require_finite(table, what, [str(i) for i in range(len(table))])
-    wrong = np.abs(table[:, INDEX.start] * (max_links - 1) - np.arange(len(table))) > TOLERANCE
-    if wrong.any():
-        i = int(wrong.argmax())
-        raise BenchmarkError(
-            f"{what}: link {i}: {INDEX.name}: {table[i, INDEX.start]:g}, not {i}/{max_links - 1}: "
-            f"made with another max_links than {max_links}, padded, or out of order"
-        )
-    shapes: dict[str, Shape] = {}
-    joints: list[Joint] = []
-    for i, row in enumerate(table):
-        try:
-            if row[GEOMETRY.columns].any():
-                shapes[f"link{i}"] = _read_shape(row)
-            if i:
-                joints.append(_read_joint(row, i, max_links))
-        except (ValueError, RobotError) as error:
-            raise BenchmarkError(f"{what}: link {i}: {error}") from error
-    names = [f"link{i}" for i in range(len(table))]
-    tool = np.flatnonzero(table[:, TOOL_FLAG.start] > 0.5)[:1].tolist()
-    positions = table[1:, POSITION.columns]
-    robot = Robot(
-        name,
-        tuple(Link(n, collisions=(shapes[n],) if n in shapes else ()) for n in names),
-        tuple(joints),
-        tuple(Frame(TOOL, names[i]) for i in tool),
-        tuple(
-            decode_position(code)
-            for joint, code in zip(joints, positions, strict=True)
-            if joint.is_movable
-        ),
-    )
-    _require_same(robot, shapes, table, what, max_links)
-    return robot, shapes
-
-
-def _require_same(
-    robot: Robot, shapes: Mapping[str, Shape], table: Array, what: str, max_links: int
-) -> None:
-    """Require that a decoded robot has the tokens it was decoded from: nothing in them is lost."""
-    expected = tokens(robot, shapes, max_links=max_links)
-    wrong = np.argwhere(np.abs(expected - table) > TOLERANCE)
-    if len(wrong):
-        row, column = wrong[0].tolist()
-        field = next(field for field in LAYOUT if column < field.columns.stop)
-        raise BenchmarkError(
-            f"{what}: link {row}: {field.name}: number {column - field.start} of "
-            f"{_format(table[row, field.columns].tolist())} is invalid; expected "
-            f"{expected[row, column]:g}"
-        )
-
-
 def _write_joint(row: Array, joint: Joint | None) -> None:
     """Write all joint fields but the position; the root counts as fixed at the identity."""
     kind = joint.kind if joint else "fixed"
@@ -336,35 +260,3 @@ def _write_joint(row: Array, joint: Joint | None) -> None:
     row[ORIGIN.columns] = encode_pose(joint.T_parent_joint if joint else IDENTITY)
     if joint is not None and joint.is_movable:
         row[AXIS.columns] = joint.unit_axis
-
-
-def _read_shape(row: Array) -> Shape:
-    """Decode the geometry of a link and its pose."""
-    kind, sizes = row[GEOMETRY.columns][:3], row[GEOMETRY.columns][3:].tolist()
-    _require_sizes(sizes)
-    x, y, z = sizes
-    primitive = (Sphere(x), Cylinder(x, z), Box((x, y, z)))[int(kind.argmax())]
-    return Shape(primitive, _read_pose(row[SHAPE_POSE.columns]))
-
-
-def _read_pose(numbers: Array) -> Pose:
-    x, y, z, *quaternion = numbers.tolist()
-    return Pose((x, y, z), rotation.normalize(quaternion))
-
-
-def _read_joint(row: Array, i: int, max_links: int) -> Joint:
-    """Decode the joint that attaches a link to one that precedes it."""
-    value = float(row[PARENT.start])
-    parent = round(value * (max_links - 1))
-    if not 0 <= parent < i:
-        raise ValueError(
-            f"{PARENT.name}: {value:g} makes no tree; expected k/{max_links - 1}, k < {i}"
-        )
-    kind = KINDS[int(row[KIND.columns].argmax())]
-    ends = f"joint{i}", kind, f"link{parent}", f"link{i}", _read_pose(row[ORIGIN.columns])
-    if kind == "fixed":
-        return Joint(*ends)
-    x, y, z = row[AXIS.columns].tolist()
-    joint = Joint(*ends, (x, y, z), (-1.0, 1.0))
-    _ = joint.unit_axis  # an axis of zeros is an error here, where the link is known
-    return joint
