@@ -42,7 +42,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from tabulate import tabulate
 
-from morphgen.benchmark.survey import DIFFICULTY_DIGITS, Fault, SplitSurvey, survey_split
+from morphgen.benchmark.survey import Fault, SplitSurvey, survey_split
 from morphgen.encoding.similarity import MEASURES, most_alike
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.files import write_atomic
@@ -58,6 +58,8 @@ COLUMNS = (*MEASURES, "joints", "reach")
 OUT = Path("results/similarity-transfer.json")
 DRAWS, SEED = 2000, 0
 """Draws of the bootstrap, and their seed."""
+DIGITS = 6
+"""Decimals of the values; rounding errors, which depend on the processor, are far smaller."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,7 @@ def compare(policies: list[Policy], survey: SplitSurvey) -> Iterator[Row]:
                 alike = survey.by_measure(name)[trained, tested]
                 best = most_alike(alike, name)
                 assert best is not None, f"no training robot of {policy.variant} has a workspace"
-                values[name] = round(float(alike[best]), DIFFICULTY_DIGITS)
+                values[name] = round(float(alike[best]), DIGITS)
             values |= {"joints": stats[tested].movable_to_tool, "reach": stats[tested].reach}
             robot = policy.test[key].name
             yield Row(policy.variant, policy.robots, policy.seed, robot, success, values)

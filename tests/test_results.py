@@ -1,6 +1,5 @@
 """The tables of docs/results.md and results/ are those that the stored studies print."""
 
-import csv
 import json
 import re
 import runpy
@@ -13,8 +12,6 @@ import pytest
 
 from morphgen.benchmark.scores.submission import EPISODES, read_table
 from morphgen.cli import main
-from morphgen.splits.split import sided_members
-from morphgen.splits.split_file import read_split, split_names
 
 ROOT = Path(__file__).parent.parent
 COMMANDS = re.findall(
@@ -123,36 +120,3 @@ def test_the_docs_have_the_constants_of_the_stored_runs():
         for name, _, _ in RUNS
     }
     assert documented == stored
-
-
-DIFFICULTY = re.findall(
-    r"(?m)^morphgen split difficulty .*$", (ROOT / "results/README.md").read_text("utf-8")
-)
-DIFFICULTY_FILES = sorted((ROOT / "results/difficulty").iterdir())
-
-
-@pytest.mark.parametrize(
-    "command", [pytest.param(command, marks=pytest.mark.slow) for command in DIFFICULTY]
-)
-def test_difficulty_of_robots_is_what_its_command_writes(command, tmp_path, monkeypatch):
-    monkeypatch.chdir(ROOT)
-    *words, path = shlex.split(command)[1:]
-    assert main([*words, str(tmp_path / "rows.csv")]) == 0
-    assert (tmp_path / "rows.csv").read_bytes() == (ROOT / path).read_bytes()
-
-
-def test_difficulty_has_every_robot_of_the_splits_of_the_paper():
-    rows = [
-        (row["split"], row["side"], row["robot"])
-        for path in DIFFICULTY_FILES
-        for row in csv.DictReader(path.read_text("utf-8").splitlines())
-    ]
-    shipped = [
-        (name, side, member.name)
-        for name in split_names()
-        for side, member in sided_members(read_split(name))
-        if member.task in ("reach", "push")
-    ]
-    assert sorted(rows) == sorted(shipped)
-    written = {shlex.split(command)[-1] for command in DIFFICULTY}
-    assert written == {f"results/difficulty/{path.name}" for path in DIFFICULTY_FILES}

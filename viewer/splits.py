@@ -119,7 +119,7 @@ def conclude_study(
     split: Split, robots: Sequence[SurveyedRobot | Fault], folders: tuple[Path, ...]
 ) -> SplitStudy:
     """Compare measured robots, audit the split and compute its statistics. Runs in a worker."""
-    survey = compare_members(split, robots, "all")
+    survey = compare_members(split, robots, all_pairs=True)
     sound = [i for i, each in enumerate(survey.robots) if isinstance(each, SurveyedRobot)]
     members = sided_members(split)
     return SplitStudy(

@@ -2,9 +2,8 @@
 
 A release is a split folder (see ``split_folder``) with further files:
 
-release.json       version of the release, evaluation, difficulty
+release.json       version of the release, evaluation
 licences.json      every part with its licence and robots; LICENCES.md is the same for readers
-difficulty.csv     size, nearest train robots and reference scores of every robot, from version 0.3
 croissant.json     description of the dataset for tools (https://docs.mlcommons.org/croissant)
 scores.json        reference scores, if there are any
 submissions/       the reference submissions that the scores were computed from
@@ -15,7 +14,6 @@ An archive is a zip of this folder. The same inputs give the same bytes.
 
 from __future__ import annotations
 
-import csv
 import datetime
 import hashlib
 import json
@@ -23,7 +21,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -32,12 +30,10 @@ from typing import Any
 import msgspec
 
 from morphgen.benchmark import licences
-from morphgen.benchmark import survey as surveys
-from morphgen.benchmark.audit import Audit, audit_survey
+from morphgen.benchmark.audit import audit
 from morphgen.benchmark.scores.submission import EvalProtocol, tasks_of_split
 from morphgen.benchmark.split_folder import (
     BUNDLED,
-    FITTED_TOLERANCE,
     README_FILE,
     ROBOTS_FILE,
     SPLIT_FILE,
@@ -56,11 +52,9 @@ from morphgen.benchmark.split_folder import (
     writing_split,
 )
 from morphgen.benchmark.texts import read_text
-from morphgen.encoding.similarity import MEASURES
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.files import file_sha256, write_atomic
 from morphgen.formats.data_files import read_json
-from morphgen.formats.data_files import read_text as read_data_text
 from morphgen.formats.files import locked_folder, replacing_folder, writing
 from morphgen.formats.records import Record, read_record
 from morphgen.formats.zip_files import ZipLimits, unpack_zip, write_zip
@@ -76,10 +70,8 @@ from morphgen.tasks.goals.split_goals import (
     sample_split_goals,
 )
 from morphgen.tasks.scenes.env_specs import GoalConfig
-from morphgen.typing import Array
 
 RELEASE_FILE = "release.json"
-DIFFICULTY_FILE = "difficulty.csv"
 SCORES_FILE = "scores.json"
 SUBMISSIONS_DIR = "submissions"
 
@@ -106,7 +98,7 @@ class Release(Record, frozen=True):
     creators: tuple[str, ...] = ()
     url: str = ""  # address of the release; empty if it is not given
     difficulty: dict[str, Any] = msgspec.field(default_factory=dict)
-    """Cosine similarity of test and train robots, and the nearest train robot by each measure."""
+    """Similarity of test and train robots, in releases of version 0.3 and earlier."""
 
     def __post_init__(self) -> None:
         if self.format != FORMAT:
@@ -213,7 +205,6 @@ def citation(split: Split, release: Release) -> str:
     )
 
 
-MAX_ROWS = 20  # largest number of test robots in the table of the card
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 """Size categories of Hugging Face by their upper bound."""
 
@@ -223,7 +214,6 @@ def card_text(
     release: Release,
     parts: Sequence[licences.LicencedPart],
     names: Iterable[str],
-    rows: Sequence[surveys.RobotDifficulty],
 ) -> str:
     """Return the dataset card; ``names`` are the paths of the files of the release."""
     present = {name.partition("/")[0] for name in names}
@@ -258,23 +248,7 @@ def card_text(
         morphgen=release.morphgen,
         id=release.id,
         folder=release.stem,
-        difficulty=_difficulty(release, rows),
         citation=citation(split, release),
-    )
-
-
-def _difficulty(release: Release, rows: Sequence[surveys.RobotDifficulty]) -> str:
-    cosine = release.difficulty["cosine"]
-    low, high = cosine["min"], cosine["max"]
-    test = [row for row in rows if row.side == "test"]
-    baselines = tuple(dict.fromkeys(name for row in rows for name in row.baselines))
-    scores = "; baselines: score, success rate" if baselines else ""
-    more = f" The table has {MAX_ROWS} of {len(test)} test robots." if test[MAX_ROWS:] else ""
-    return (
-        f"Cosine similarity of test and train robots: {cosine['mean']:.2f} (from {low:.2f} to "
-        f"{high:.2f}). `{DIFFICULTY_FILE}` has a row per robot, train robots too.{more} Nearest: "
-        f"the most similar train robot and its value by each measure{scores}.\n\n"
-        f"{surveys.difficulty_table(test[:MAX_ROWS], baselines, 'github')}"
     )
 
 
@@ -358,27 +332,26 @@ def require_releasable(
     """Require valid names and allowed licences of a release; return the parts of its robots."""
     parts = licences.licenced_parts(split, library)
     licences.require_allowed(split, parts, request.allowed_licences)
-    _release(split, request, {})
+    _release(split, request)
     return parts
 
 
 def check_release(
     split: Split, library: Library, request: ReleaseRequest, *, jobs: int = 1
-) -> tuple[Release, tuple[licences.LicencedPart, ...], surveys.SplitSurvey]:
+) -> tuple[Release, tuple[licences.LicencedPart, ...]]:
     """Require that a split may be released: names, licences of its parts, and audit.
 
-    Return the description of the release, the parts of the robots, and their survey.
+    Return the description of the release and the parts of the robots.
     """
     parts = require_releasable(split, library, request)
-    survey = surveys.survey_split(split, library, pairs="train", jobs=jobs)
-    audited = audit_survey(survey, library)
+    audited = audit(split, library, jobs=jobs)
     if not audited.passed():
         first = next(each for each in audited.findings if each.severity == "error")
         raise BenchmarkError(
             f"{split.name} fails its audit: {first.code} at {first.where}: {first.why}; see "
             "morphgen split audit"
         )
-    return _release(split, request, _difficulty_data(survey, audited)), parts, survey
+    return _release(split, request), parts
 
 
 def archive_path(out: Path, split: Split, release_version: str) -> Path:
@@ -393,12 +366,10 @@ def release_split(
     request: ReleaseRequest,
     *,
     extra: Mapping[str, bytes] | None = None,
-    results: surveys.BaselineResults | None = None,
     jobs: int = 1,
 ) -> ReleaseReport:
     """Write the archive of a release into a folder."""
-    release, parts, survey = check_release(split, library, request, jobs=jobs)
-    rows = surveys.survey_difficulty(survey, results)
+    release, parts = check_release(split, library, request, jobs=jobs)
     goals: list[GoalResult] = []
     if request.goals:
         goals = sample_split_goals(split, library, request.protocol.goals, jobs=jobs)
@@ -415,15 +386,14 @@ def release_split(
             jobs=jobs,
         )
         data = msgspec.to_builtins(release)
-        data = {key: value for key, value in data.items() if value not in ("", [], ())}
+        data = {key: value for key, value in data.items() if value not in ("", [], (), {})}
         texts = {
             RELEASE_FILE: json.dumps({"format": release.format, **data}, indent=2) + "\n",
             **licences.licence_files(parts),
-            DIFFICULTY_FILE: surveys.difficulty_csv(rows, tuple(results or ())),
         }
         files = {name: text.encode() for name, text in texts.items()} | dict(extra or {})
         known = [*read_sums(report.folder / SUMS_FILE), *files]
-        files[README_FILE] = card_text(split, release, parts, known, rows).encode()
+        files[README_FILE] = card_text(split, release, parts, known).encode()
         _add_files(report.folder, files)
         sums = read_sums(report.folder / SUMS_FILE)
         croissant = croissant_text(split, release, parts, sums)
@@ -431,7 +401,7 @@ def release_split(
         return _write_archive(report.folder, out, release)
 
 
-def _release(split: Split, request: ReleaseRequest, difficulty: Mapping[str, Any]) -> Release:
+def _release(split: Split, request: ReleaseRequest) -> Release:
     data = {
         "name": split.name,
         "id": split_id(split),
@@ -441,21 +411,8 @@ def _release(split: Split, request: ReleaseRequest, difficulty: Mapping[str, Any
         "creators": list(request.creators),
         "url": request.url,
         "evaluation": request.protocol.as_data(split),
-        "difficulty": dict(difficulty),
     }
     return read_record(data, Release, "release", BenchmarkError)
-
-
-def _difficulty_data(survey: surveys.SplitSurvey, audited: Audit) -> dict[str, Any]:
-    """Return the similarity of test and train robots as JSON data."""
-    nearest = {
-        test: {
-            measure: {"train": found.train, "value": round(found.value, surveys.DIGITS)}
-            for measure, found in trains.items()
-        }
-        for test, trains in audited.nearest.items()
-    }
-    return {"cosine": surveys.summarize_survey(survey)["cosine"], "nearest": nearest}
 
 
 def _add_files(folder: Path, files: Mapping[str, bytes]) -> None:
@@ -485,12 +442,6 @@ def _write_archive(folder: Path, out: Path, release: Release) -> ReleaseReport:
     return ReleaseReport(archive, digest, content, len(files), archive.stat().st_size)
 
 
-_MAX_SHOWN = 100  # largest number of characters of a cell in a message
-_NUMBERS = ("reach", *MEASURES)  # columns that are compared with `FITTED_TOLERANCE`
-_NEAREST = {surveys.nearest_column(name): name for name in MEASURES}
-"""Measure by the column of its nearest train robot."""
-
-
 def _release_differences(folder: Path, split: Split, library: Library) -> Iterator[Difference]:
     """Yield what a release states otherwise than its split."""
     try:
@@ -516,52 +467,6 @@ def _without_sources(parts: Any) -> list[Any]:  # noqa: ANN401
     ]
 
 
-def _difficulty_differences(path: Path, survey: surveys.SplitSurvey) -> Iterator[str]:
-    """Yield how the structural columns of ``difficulty.csv`` differ from those of a survey."""
-    try:
-        header, *lines = csv.reader(read_data_text(path).splitlines() or [""])
-    except (MorphgenError, csv.Error) as error:
-        yield f"cannot be read: {error}"
-        return
-    if tuple(header[: len(surveys.STRUCTURAL)]) != surveys.STRUCTURAL:
-        yield f"it has other columns; expected {', '.join(surveys.STRUCTURAL)}"
-        return
-    rows = surveys.survey_difficulty(survey)
-    if len(lines) != len(rows):
-        yield f"it has {len(lines)} robots, not {len(rows)}"
-        return
-    names = [member.name for member in survey.split.train]
-    for i, (cells, row) in enumerate(zip(lines, rows, strict=True)):
-        if len(cells) != len(header):
-            yield f"line {i + 2} has {len(cells)} cells, not {len(header)}"
-            continue
-        line = dict(zip(header, cells, strict=True))
-        similarity = dict(zip(names, surveys.train_similarity(survey, i), strict=True))
-        for why in _row_differences(line, row, similarity):
-            yield f"line {i + 2}: {why}"
-
-
-def _row_differences(
-    line: Mapping[str, str], row: surveys.RobotDifficulty, similarity: Mapping[str, Array]
-) -> Iterator[str]:
-    """Yield how a line differs from a robot's row, given its similarity to every train robot."""
-    cells = surveys.difficulty_cells(row)
-    for column in surveys.STRUCTURAL:
-        found, expected = line[column], cells.get(column, "")
-        if found == expected:
-            continue
-        with suppress(ValueError):  # of a cell that is no number
-            if column in _NUMBERS and abs(float(found) - float(expected)) <= FITTED_TOLERANCE:
-                continue
-        if column in _NEAREST and found in similarity:
-            # Of nearly equal train robots another one may be the nearest on another machine.
-            measure, value = _NEAREST[column], similarity[found]
-            best = row.nearest.get(measure)
-            if best and abs(value[tuple(MEASURES).index(measure)] - best.value) <= FITTED_TOLERANCE:
-                continue
-        yield f"{column} of {row.robot} is {found[:_MAX_SHOWN]!r}, not {expected!r}"
-
-
 @dataclass(frozen=True)
 class Verification:
     """Result of a verification."""
@@ -576,7 +481,7 @@ def verify(name_or_path: str | Path, library: Library, *, jobs: int = 1) -> Veri
     """Compare a split with the robots that its derivations give today, by its id and their hashes.
 
     In a folder every file is compared with ``SHA256SUMS`` and with the robot of its derivation; in
-    a release also its description, its licences and its difficulty.
+    a release also its description and its licences.
     """
     folder = Path(name_or_path)
     if is_archive(folder):
@@ -595,17 +500,9 @@ def verify(name_or_path: str | Path, library: Library, *, jobs: int = 1) -> Veri
     if not is_built:
         differences += compare_robots(split, library, jobs=jobs)
         return Verification(split, computed_id, tuple(differences))
-    difficulty = folder / DIFFICULTY_FILE
-    has_difficulty = is_release(folder) and difficulty.exists()  # version 0.2 wrote none
-    found, robots = compare_folder(folder, split, library, with_features=has_difficulty, jobs=jobs)
-    differences += found
+    differences += compare_folder(folder, split, library, jobs=jobs)
     if not is_release(folder):
         return Verification(split, computed_id, tuple(differences))
     differences += _release_differences(folder, split, library)
-    if has_difficulty and robots:
-        known = [robots[member.robot_hash] for member in surveys.different_members(split)]
-        survey = surveys.compare_members(split, known, "train", jobs=jobs)
-        faults = _difficulty_differences(difficulty, survey)
-        differences += [Difference(DIFFICULTY_FILE, why) for why in faults]
     content = file_sha256(folder / SUMS_FILE)
     return Verification(split, computed_id, tuple(differences), content)

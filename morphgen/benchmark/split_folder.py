@@ -512,7 +512,6 @@ class _BuiltFolder:
 
     path: Path
     light: bool
-    with_features: bool  # whether the robots get features
     robot_paths: Mapping[str, str]  # folder of each robot by its hash
 
 
@@ -528,7 +527,7 @@ def _inspect_member(
         # Members with the same robot share the folder of the first one, which is compared.
         is_first = folder.name == member.name
         lines = differences(folder, robot, light=built.light) if is_first else []
-        return lines, measure_robot(robot, library, max_links, with_features=built.with_features)
+        return lines, measure_robot(robot, library, max_links, with_features=False)
     except MorphgenError as error:
         return [str(error)], None
 
@@ -551,10 +550,8 @@ def _robot_differences(
             yield Difference(member.name, why)
 
 
-def compare_folder(
-    folder: Path, split: Split, library: Library, *, with_features: bool, jobs: int
-) -> tuple[list[Difference], Mapping[str, SurveyedRobot]]:
-    """Compare a split folder with ``SHA256SUMS`` and its robots; return also these, by hash."""
+def compare_folder(folder: Path, split: Split, library: Library, *, jobs: int) -> list[Difference]:
+    """Compare a split folder with ``SHA256SUMS`` and its robots."""
     build, found = read_settings(folder / BUILD_FILE), list[Difference]()
     if build.split != split_id(split):
         why = f"it is of split {build.split}, not of {SPLIT_FILE}"
@@ -562,9 +559,9 @@ def compare_folder(
     try:
         paths = robot_paths(split)
     except BenchmarkError as error:
-        return [*found, Difference(SPLIT_FILE, str(error))], {}
+        return [*found, Difference(SPLIT_FILE, str(error))]
     files = list(_file_differences(folder))
-    built = _BuiltFolder(folder, build.light, with_features, paths)
+    built = _BuiltFolder(folder, build.light, paths)
     inspected = _inspect(split, library, built, jobs)
     # A changed file explains the differences of its robot.
     explained = {difference.where for difference in files}
@@ -574,13 +571,13 @@ def compare_folder(
         robot_hash: robot for (_, robot_hash), (_, robot) in inspected.items() if robot is not None
     }
     if not known.keys() >= paths.keys():
-        return found, {}
+        return found
     for name, compare in ((ROBOTS_FILE, _record_differences), (TOKENS_FILE, _token_differences)):
         try:
             found += compare(folder / name, split, known)
         except MorphgenError as error:
             found.append(Difference(name, str(error)))
-    return found, known
+    return found
 
 
 def _file_differences(folder: Path) -> Iterator[Difference]:

@@ -1,16 +1,14 @@
 """Compose and measure all robots of a split, and compare each test robot with each train robot.
 
-The audit is computed from this survey, and so are the statistics and the difficulty below.
+The audit is computed from this survey, and so are the statistics below.
 """
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache, partial
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import yaml
@@ -31,7 +29,6 @@ from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map
 from morphgen.progress import part_of
 from morphgen.splits.split import SIDES, Member, Side, Split, sided_members
-from morphgen.tables import table
 from morphgen.typing import Array
 
 
@@ -66,10 +63,6 @@ class SurveyedRobot:
     tokens: Array = field(compare=False, repr=False)  # tokens at home, shape (n_links, 48)
     features: Features | None = field(compare=False, repr=False)
     """Features of the robot, which the similarity measures compare; None if none is asked for."""
-
-
-Pairs = Literal["sides", "train", "all"]
-"""Pairs of robots that are compared: test with train, train robots with each other too, or all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,9 +154,7 @@ def different_members(split: Split) -> list[Member]:
     return list(firsts.values())
 
 
-def survey_split(
-    split: Split, library: Library, *, pairs: Pairs = "sides", jobs: int = 1
-) -> SplitSurvey:
+def survey_split(split: Split, library: Library, *, jobs: int = 1) -> SplitSurvey:
     """Compose, measure and compare the robots of a split; equal ones once."""
     unique = different_members(split)
     total = 2 * len(unique)
@@ -171,20 +162,25 @@ def survey_split(
         measure = partial(survey_robot, library, split.max_links)
         robots = list(parallel_map(measure, unique, jobs))
     with part_of(total, len(unique)):
-        return compare_members(split, robots, pairs, jobs=jobs)
+        return compare_members(split, robots, jobs=jobs)
 
 
 def compare_members(
-    split: Split, robots: Sequence[SurveyedRobot | Fault], pairs: Pairs, *, jobs: int = 1
+    split: Split,
+    robots: Sequence[SurveyedRobot | Fault],
+    *,
+    all_pairs: bool = False,
+    jobs: int = 1,
 ) -> SplitSurvey:
-    """Return the survey of a split from its robots in the order of ``different_members``."""
+    """Return the survey of a split from its robots in the order of ``different_members``.
+
+    Test robots are compared with train robots; with ``all_pairs`` all with each other.
+    """
     number = {member.derivation: i for i, member in enumerate(different_members(split))}
     train, test = ([number[member.derivation] for member in split.side(side)] for side in SIDES)
     compared = np.zeros((len(robots), len(robots)), dtype=np.bool_)
     compared[np.ix_(train, test)] = True
-    if pairs != "sides":
-        compared[np.ix_(train, train)] = True
-    compared |= compared.T | (pairs == "all")
+    compared |= compared.T | all_pairs
     # Workers get the features alone: 74 kB a robot, most of it the density of the workspace.
     known = tuple(None if isinstance(robot, Fault) else robot.features for robot in robots)
     values = np.full((len(robots), len(robots), len(MEASURES)), np.nan)
@@ -264,120 +260,12 @@ def paper_rows() -> dict[str, PaperRow]:
     return rows
 
 
-DIFFICULTY_DIGITS = 6
-"""Decimals of all numbers. Near duplicates differ in the fourth one
-(``similarity.NEAR_THRESHOLDS``); rounding errors, which depend on the processor, are far
-smaller."""
-
-
 @dataclass(frozen=True)
 class NearestTrain:
     """The train robot that is most similar to a robot by one measure."""
 
     train: str  # name of the train robot
     value: float  # value of the measure
-
-
-@dataclass(frozen=True)
-class BaselineResult:
-    """Result of a baseline on a robot."""
-
-    score: float
-    """Mean score, relative to the random policy for tasks with ``Task.relative_to_random``."""
-    success: float  # success rate, 0 to 1
-
-
-BaselineResults: TypeAlias = Mapping[str, Mapping[tuple[Side, str], BaselineResult]]
-"""Results by name of the baseline, then by side and name of the robot."""
-
-
-@dataclass(frozen=True)
-class RobotDifficulty:
-    """A row of the difficulty of a split: a robot with its task."""
-
-    split: str  # name of the split
-    side: Side
-    robot: str  # name of the robot
-    task: str
-    obstacles: bool  # the scene has obstacles
-    movable_to_tool: int  # number of movable joints between the root and the tool's link
-    links: int
-    reach: float  # largest distance of the tool from the root's origin [m]
-    nearest: Mapping[str, NearestTrain]
-    """Nearest train robot by the name of the measure, with its value rounded to
-    ``DIFFICULTY_DIGITS``; empty if there is no other train robot."""
-    baselines: Mapping[str, BaselineResult] = field(default_factory=dict)
-    """Results of baselines by name, without those that cannot do the task."""
-
-    def as_dict(self) -> dict[str, object]:
-        """Return plain data for JSON, without ``baselines`` if there are none."""
-        data = {key: value for key, value in vars(self).items() if key != "baselines"}
-        data["nearest"] = {name: vars(nearest) for name, nearest in self.nearest.items()}
-        if self.baselines:
-            data["baselines"] = {name: vars(result) for name, result in self.baselines.items()}
-        return data
-
-
-def split_difficulty(
-    split: Split, library: Library, *, results: BaselineResults | None = None, jobs: int = 1
-) -> tuple[RobotDifficulty, ...]:
-    """Compose, measure and compare the robots of a split; see ``survey_difficulty``."""
-    survey = survey_split(split, library, pairs="train", jobs=jobs)
-    return survey_difficulty(survey, results)
-
-
-def survey_difficulty(
-    survey: SplitSurvey, results: BaselineResults | None = None
-) -> tuple[RobotDifficulty, ...]:
-    """Return a row per robot, train robots first.
-
-    The nearest robot of a train robot is another one: robots with the same hash, such as the same
-    robot at another task, do not count. A test robot is compared with all train robots.
-    """
-    return tuple(_rows(survey, results or {}))
-
-
-def _rows(survey: SplitSurvey, results: BaselineResults) -> Iterator[RobotDifficulty]:
-    split = survey.split
-    robots = (*survey.composed("train"), *survey.composed("test"))
-    for i, ((side, member), robot) in enumerate(zip(sided_members(split), robots, strict=True)):
-        if robot.robot_hash != member.robot_hash:
-            raise BenchmarkError(
-                f"split {split.name!r}: robot {member.name!r}: the split names body "
-                f"{member.robot_hash}, but its derivation gives {robot.robot_hash}: a part, or "
-                "morphgen, has changed since"
-            )
-        nearest = nearest_train(split.train, train_similarity(survey, i))
-        baselines = {
-            name: BaselineResult(_rounded(result.score), _rounded(result.success))
-            for name, found in results.items()
-            if (result := found.get((side, member.name)))
-        }
-        yield RobotDifficulty(
-            split.name,
-            side,
-            member.name,
-            member.task,
-            member.obstacles,
-            robot.stats.movable_to_tool,
-            robot.stats.links,
-            _rounded(robot.stats.reach),
-            {name: replace(found, value=_rounded(found.value)) for name, found in nearest.items()},
-            baselines,
-        )
-
-
-def train_similarity(survey: SplitSurvey, index: int) -> Array:
-    """Return the similarity to the train robots, NaN to itself, shape (n_train, n_measures)."""
-    split = survey.split
-    similarity = survey.similarity[: len(split.train), index]
-    if index >= len(split.train):
-        return similarity
-    if np.isnan(similarity[index]).all():
-        raise ValueError("the survey does not compare train robots; expected pairs='train'")
-    own = split.train[index].robot_hash
-    is_other = np.array([member.robot_hash != own for member in split.train])
-    return np.where(is_other[:, None], similarity, np.nan)
 
 
 def nearest_train(train: Sequence[Member], similarity: Array) -> dict[str, NearestTrain]:
@@ -387,74 +275,3 @@ def nearest_train(train: Sequence[Member], similarity: Array) -> dict[str, Neare
         for name, values in zip(MEASURES, similarity.T, strict=True)
         if (best := most_alike(values, name)) is not None
     }
-
-
-def _rounded(value: float) -> float:
-    """Return a number with ``DIFFICULTY_DIGITS`` decimals; 0 instead of -0."""
-    return round(float(value), DIFFICULTY_DIGITS) + 0.0
-
-
-def nearest_column(measure: str) -> str:
-    """Return the column with the nearest train robot by a measure."""
-    return f"{measure}_nearest"
-
-
-STRUCTURAL = (
-    *("split", "side", "robot", "task", "obstacles", "movable_to_tool", "links", "reach"),
-    *(column for name in MEASURES for column in (nearest_column(name), name)),
-)
-"""Columns that follow from the split alone; reach is in metres."""
-
-
-def difficulty_csv(rows: Sequence[RobotDifficulty], baselines: Sequence[str] = ()) -> str:
-    """Return a CSV table with a line per robot: ``STRUCTURAL``, then two columns per baseline."""
-    text = io.StringIO()
-    results = (f"{name}_{key}" for name in baselines for key in ("score", "success"))
-    columns = (*STRUCTURAL, *results)
-    writer = csv.DictWriter(text, columns, "", extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(map(difficulty_cells, rows))
-    return text.getvalue()
-
-
-def difficulty_cells(row: RobotDifficulty) -> dict[str, str]:
-    """Return the cells of a robot in the CSV table by column, without empty ones."""
-    cells = {key: str(getattr(row, key)) for key in ("split", "side", "robot", "task")}
-    cells |= {"obstacles": str(row.obstacles).lower(), "reach": _number(row.reach)}
-    cells |= {key: str(getattr(row, key)) for key in ("movable_to_tool", "links")}
-    for measure, found in row.nearest.items():
-        cells |= {nearest_column(measure): found.train, measure: _number(found.value)}
-    for name, result in row.baselines.items():
-        cells |= {f"{name}_{key}": _number(value) for key, value in vars(result).items()}
-    return cells
-
-
-def _number(value: float) -> str:
-    """Return a number with all its decimals, never with an exponent."""
-    return f"{value:.{DIFFICULTY_DIGITS}f}"
-
-
-def difficulty_table(
-    rows: Sequence[RobotDifficulty], baselines: Sequence[str] = (), style: str = "simple"
-) -> str:
-    """Return a table of the robots of one split for readers; ``style`` is one of tabulate's."""
-    headers = (
-        *("robot", "side", "task", "movable to tool", "links", "reach (m)"),
-        *(f"nearest by {name}" for name in MEASURES),
-        *baselines,
-    )
-    cells = [tuple(_cells(row, baselines)) for row in rows]
-    last = [name for name in headers if name.startswith("nearest")]
-    return table(cells, headers, style=style, last=last)
-
-
-def _cells(row: RobotDifficulty, baselines: Sequence[str]) -> Iterator[str]:
-    yield from (row.robot, row.side, row.task + (" (obstacles)" if row.obstacles else ""))
-    yield from (str(row.movable_to_tool), str(row.links), f"{row.reach:.2f}")
-    for measure in MEASURES:
-        nearest = row.nearest.get(measure)
-        yield "-" if nearest is None else f"{nearest.train} {nearest.value:.3f}"
-    for name in baselines:
-        result = row.baselines.get(name)
-        # Adding 0.0 turns -0.0 into 0.0.
-        yield "-" if result is None else f"{round(result.score, 1) + 0.0:.1f}, {result.success:.0%}"

@@ -42,10 +42,9 @@ from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, status
 from morphgen.encoding.similarity import MEASURES, NEAR_THRESHOLDS, NearThresholds
 from morphgen.errors import BenchmarkError, GrammarError, PartError
-from morphgen.formats.files import require_writable_file, require_writable_folder, write_file
+from morphgen.formats.files import require_writable_folder
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding
-from morphgen.rl.baselines import BASELINES
 from morphgen.rl.scores import POWER
 from morphgen.splits.split import HOLD_OUT, REGIMES, SIDES, Split, split_id
 from morphgen.splits.split_file import read_split, split_names, split_paths, write_new_splits
@@ -187,46 +186,6 @@ def verify(args: argparse.Namespace) -> int:
 
     opt.print_result(args, data, text)
     return int(bool(differences))
-
-
-def difficulty(args: argparse.Namespace) -> None:
-    """Measure the robots of splits, print a table per split and write the file."""
-    if args.csv is not None:
-        require_writable_file(args.csv, "--csv", ".csv")
-    words: dict[str, str] = {}
-    splits = [split_folder.read_split_or_folder(name)[0] for name in args.splits]
-    for split, name in zip(splits, args.splits, strict=True):
-        opt.require_other_name(words, split.name, name)
-    results = [scores.study_results(args.study, split) if args.study else {} for split in splits]
-    library = opt.library_of(args)
-    rows: list[survey.RobotDifficulty] = []
-    for split, known in zip(splits, results, strict=True):
-        with bar(args, split.name):
-            rows += survey.split_difficulty(split, library, results=known, jobs=args.jobs)
-    baselines = [name for name in BASELINES if any(name in known for known in results)]
-    if args.csv is not None:
-        write_file(args.csv, survey.difficulty_csv(rows, baselines))
-    files = [] if args.csv is None else [str(args.csv)]
-    data = {"rows": [row.as_dict() for row in rows], "files": files}
-    opt.print_result(args, data, lambda: _difficulty_text(rows, splits, baselines, files))
-
-
-def _difficulty_text(
-    rows: Sequence[survey.RobotDifficulty],
-    splits: Sequence[Split],
-    baselines: Sequence[str],
-    files: Sequence[str],
-) -> str:
-    """Return a table per split, each with the baselines of its tasks, and the written files."""
-    parts = []
-    for split in splits:
-        own = [row for row in rows if row.split == split.name]
-        columns = [name for name in baselines if any(name in row.baselines for row in own)]
-        parts.append(f"{split.name}\n{survey.difficulty_table(own, columns)}")
-    notes = ["nearest: the most similar other train robot and its value by each measure"]
-    if baselines:
-        notes.append("baselines: score, success rate")
-    return "\n".join(["\n\n".join(parts), "", *notes, *files])
 
 
 def stats(args: argparse.Namespace) -> None:
@@ -380,13 +339,12 @@ def release(args: argparse.Namespace) -> None:
     split, library = read_split(args.split), opt.library_of(args)
     protocol = EvalProtocol(args.sim or DEFAULT_SIMULATOR, args.episodes or DEFAULT_EPISODES)
     extra: dict[str, bytes] = {}
-    results: survey.BaselineResults = {}
     if args.scores:
         with bar(args, "checking the scores"):
             references = scores.collect_references(
                 args.scores, split, protocol, library, jobs=args.jobs
             )
-        extra, results = scores.reference_files(references), references.results()
+        extra = scores.reference_files(references)
     request = releases.ReleaseRequest(
         version=args.release_version,
         date=args.date,
@@ -413,7 +371,7 @@ def release(args: argparse.Namespace) -> None:
         return
     with bar(args, "releasing"):
         report = releases.release_split(
-            split, args.out, library, request, extra=extra, results=results, jobs=args.jobs
+            split, args.out, library, request, extra=extra, jobs=args.jobs
         )
     lines = [
         f"{report.archive}: {report.files} files, {report.bytes / 1e6:.2f} MB",

@@ -1,6 +1,5 @@
-"""Surveys of splits: leaks and broken rules that the audit finds, statistics, difficulty."""
+"""Surveys of splits: leaks and broken rules that the audit finds, and statistics."""
 
-import csv
 from dataclasses import replace
 
 import numpy as np
@@ -9,20 +8,13 @@ import pytest
 from helpers.splits import LIBRARY, TEST, TRAIN, combined, member, split
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.survey import (
-    STRUCTURAL,
-    BaselineResult,
-    NearestTrain,
-    RobotDifficulty,
-    difficulty_csv,
-    difficulty_table,
+    compare_members,
+    different_members,
     paper_row,
     paper_rows,
-    robot_stats,
-    split_difficulty,
     statistics,
-    survey_difficulty,
+    survey_robot,
     survey_split,
-    train_similarity,
 )
 from morphgen.encoding.similarity import MEASURES, NearThresholds, features, is_near
 from morphgen.errors import BenchmarkError
@@ -32,7 +24,6 @@ from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.sampling import sample_robot
 from morphgen.progress import show_progress
-from morphgen.splits.split import SIDES, compose_member
 from morphgen.splits.split_file import split_names
 
 
@@ -226,93 +217,12 @@ def test_rows_of_the_paper_and_scenarios_match():
     assert paper_row("mine/arms/push") is None
 
 
-RESULTS = {
-    "random": {("train", "gantry-plane"): BaselineResult(0.0, 0.25)},
-    "ik": {("test", "planar-plane"): BaselineResult(-1e-9, 1 / 3)},
-}
-
-
-@pytest.fixture(scope="module")
-def rows():
-    return split_difficulty(combined(), LIBRARY, results=RESULTS)
-
-
-def test_a_row_has_the_size_of_its_robot_and_the_nearest_other_train_robot(rows):
-    example = combined()
-    members = [(side, each) for side in SIDES for each in example.side(side)]
-    robots = {each.name: compose_member(each, LIBRARY) for _, each in members}
-    known = {name: features(robot, token_shapes(robot)) for name, robot in robots.items()}
-    assert [(row.side, row.robot) for row in rows] == [(side, each.name) for side, each in members]
-    for row in rows:
-        stats = robot_stats(robots[row.robot])
-        assert (row.split, row.task, row.obstacles) == ("mine/some", "push", False)
-        assert (row.movable_to_tool, row.links) == (stats.movable_to_tool, stats.links)
-        assert row.reach == pytest.approx(stats.reach, abs=1e-6)
-        for name, measure in MEASURES.items():
-            values = {
-                each.name: measure.function(known[row.robot], known[each.name])
-                for each in example.train
-                if each.name != row.robot
-            }
-            best = (max if measure.larger_is_more_alike else min)(values.values())
-            assert row.nearest[name].value == pytest.approx(best, abs=1e-6)
-            assert values[row.nearest[name].train] == pytest.approx(best, abs=1e-9)
-
-
-def test_the_same_robot_at_another_task_is_no_other_train_robot():
-    twin = member(TRAIN[0], "twin", task="reach")
-    twin = replace(twin, derivation=twin.derivation.replace("size=0.1", "size=0.10"))
-    example = split([TRAIN[0], twin], TEST)
-    assert example.train[0].robot_hash == twin.robot_hash
-    assert example.train[0].derivation != twin.derivation
-    first, second, *_, test = split_difficulty(example, LIBRARY)
-    assert (first.nearest, second.nearest) == ({}, {})
-    assert test.nearest["tree"].train == "gantry-plane"
-    cells = dict(zip(STRUCTURAL, difficulty_csv([first]).splitlines()[1].split(","), strict=True))
-    assert {cells[name] for name in MEASURES} == {""}
-    assert difficulty_table([first]).splitlines()[-1].split()[-3:] == ["-", "-", "-"]
-
-
-def test_results_of_baselines_belong_to_side_and_robot(rows):
-    assert [list(row.baselines) for row in rows] == [["random"], [], [], ["ik"]]
-    assert rows[-1].baselines["ik"] == BaselineResult(0.0, 0.333333)
-    assert str(rows[-1].baselines["ik"].score) == "0.0"  # not -0.0
-    assert rows[-1].as_dict()["baselines"] == {"ik": {"score": 0.0, "success": 0.333333}}
-    assert "baselines" not in rows[1].as_dict()
-
-
-def test_the_csv_has_the_same_bytes_with_any_number_of_jobs(rows):
-    again = split_difficulty(combined(), LIBRARY, results=RESULTS, jobs=2)
-    assert difficulty_csv(again, ("ik",)) == difficulty_csv(rows, ("ik",))
-    header, *lines = csv.reader(difficulty_csv(rows, ("random", "ik")).splitlines())
-    results = ["random_score", "random_success", "ik_score", "ik_success"]
-    assert header == [*STRUCTURAL, *results]
-    cells = [",".join(line[-4:]) for line in lines]
-    assert cells == ["0.000000,0.250000,,", ",,,", ",,,", ",,0.000000,0.333333"]
-    nearest = {name: NearestTrain("a,b", 1e-6) for name in MEASURES}
-    row = RobotDifficulty("s", "test", "r", "reach", True, 2, 3, 0.1 + 0.2, nearest)
-    (line,) = csv.reader(difficulty_csv([row]).splitlines()[1:])
-    assert line[:8] == ["s", "test", "r", "reach", "true", "2", "3", "0.300000"]
-    assert line[8:] == ["a,b", "0.000001"] * len(MEASURES)  # no exponent
-
-
-def test_train_robots_are_compared_symmetrically_and_not_with_themselves():
+def test_train_robots_are_compared_symmetrically_and_only_on_request():
     twins = split([*TRAIN, member(TRAIN[0], "twin")], TEST)
-    survey = survey_split(twins, LIBRARY, pairs="train")
+    robots = [survey_robot(LIBRARY, twins.max_links, each) for each in different_members(twins)]
+    survey = compare_members(twins, robots, all_pairs=True)
     assert survey.similarity.shape == (5, 5, len(MEASURES))
     pairs = survey.similarity[:4, :4]
     assert (pairs[0, 1:3] == pairs[1:3, 0]).all()
     assert (pairs[0, 1:3] == pairs[3, 1:3]).all()
-    assert np.isnan(train_similarity(survey, 0)[[0, 3]]).all()
     assert np.isnan(survey_split(combined(), LIBRARY).similarity[:3, :3]).all()
-
-
-def test_robots_that_changed_or_cannot_be_composed_are_refused():
-    other = replace(member(TRAIN[0]), name="other", robot_hash="0" * 32)
-    with pytest.raises(BenchmarkError, match=r"robot 'other': the split names body 0{32}, but"):
-        split_difficulty(combined([*TRAIN, other]), LIBRARY)
-    missing = replace(other, derivation=other.derivation.replace("plane", "planf"))
-    with pytest.raises(BenchmarkError, match=r"'mine/some': robot 'other': .* no part 'planf'"):
-        split_difficulty(combined([*TRAIN, missing]), LIBRARY)
-    with pytest.raises(ValueError, match="expected pairs='train'"):
-        survey_difficulty(survey_split(combined(), LIBRARY))

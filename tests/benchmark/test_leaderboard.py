@@ -2,7 +2,6 @@
 
 import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,7 +20,6 @@ from helpers.submissions import (
 )
 from morphgen.benchmark.scores import results as results_module
 from morphgen.benchmark.scores.results import (
-    References,
     Row,
     SideScore,
     collect_references,
@@ -35,7 +33,6 @@ from morphgen.benchmark.scores.results import (
     reference_files,
     score_runs,
     smallest_differences,
-    study_results,
 )
 from morphgen.benchmark.scores.submission import (
     EPISODES,
@@ -43,7 +40,6 @@ from morphgen.benchmark.scores.submission import (
     append_submission,
     require_same_random,
 )
-from morphgen.benchmark.survey import BaselineResult
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import default_library
 from morphgen.rl.scores import (
@@ -254,54 +250,3 @@ def test_references_that_disagree_about_the_random_policy_need_a_submission_of_i
         collect_references(paths[:2], SPLIT, PROTOCOL, LIBRARY)
     references = collect_references(paths, SPLIT, PROTOCOL, LIBRARY)
     assert "submissions/random.json" in reference_files(references)
-
-
-NAMES = [(each.side, each.member.name) for each in EXPECTED]
-
-
-def write(folder, *submissions):
-    """Write the table of a study."""
-    for values in submissions:
-        append_submission(folder / EPISODES, submission(values))
-
-
-def random_policy():
-    """Return the random policy, which scores -1 in each episode."""
-    values = data("random", successes=0) | BASELINE
-    for robot in values["robots"]:
-        robot["random_score"] = robot["score"]
-    return values
-
-
-def test_a_study_gives_the_results_of_its_baselines_in_order(tmp_path):
-    write(tmp_path, data("ik", near=100.0) | BASELINE, random_policy(), data("zero"))
-    results = study_results(tmp_path, SPLIT)
-    assert list(results) == ["random", "ik"]
-    assert results["ik"] == dict.fromkeys(NAMES, BaselineResult(77.5, 0.75))
-
-
-def test_references_give_results_relative_to_random_policy():
-    ik = submission(data("ik", near=100.0) | BASELINE)
-    policy = submission(data("zero"))  # of this name
-    results = References((ik, policy, submission(random_policy()))).results()
-    assert list(results) == ["random", "ik"]
-    assert results["random"] == dict.fromkeys(NAMES, BaselineResult(0.0, 0.0))
-    # Episodes 100, 101, 102 and -1, relative to those of random.
-    assert results["ik"] == dict.fromkeys(NAMES, BaselineResult(76.5, 0.75))
-    alone = References((ik,)).results()  # relative to the -2 in its own file
-    assert alone["ik"] == dict.fromkeys(NAMES, BaselineResult(77.5, 0.75))
-    assert References().results() == {}
-
-
-def test_studies_that_do_not_fit_are_refused(tmp_path):
-    with pytest.raises(BenchmarkError, match=r"expected the output folder of morphgen study"):
-        study_results(tmp_path, SPLIT)
-    write(tmp_path, random_policy())
-    with pytest.raises(BenchmarkError, match=r"of baselines on split 'mine/smal'.* did"):
-        study_results(tmp_path, replace(SPLIT, name="mine/smal"))
-    with pytest.raises(BenchmarkError, match=r"random: of other robots: split id "):
-        study_results(tmp_path, replace(SPLIT, test=SPLIT.train[:1]))
-    evaluation = data()["evaluation"] | {"simulator": "pybullet"}
-    write(tmp_path, data("ik") | BASELINE | {"evaluation": evaluation})
-    with pytest.raises(BenchmarkError, match=r"ik: evaluation.simulator 'pybullet'; expected 'muj"):
-        study_results(tmp_path, SPLIT)

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import re
 import zipfile
 from dataclasses import replace
 
@@ -14,7 +13,6 @@ from helpers.splits import TEST, TRAIN, combined, member
 from morphgen.benchmark import release as release_module
 from morphgen.benchmark.licences import CROISSANT_FILE, LICENCES_FILE
 from morphgen.benchmark.release import (
-    DIFFICULTY_FILE,
     RELEASE_FILE,
     ReleaseRequest,
     opened_folder,
@@ -30,7 +28,6 @@ from morphgen.benchmark.split_folder import (
     read_sums,
     sums_text,
 )
-from morphgen.benchmark.survey import BaselineResult, difficulty_csv, split_difficulty
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.zip_files import ZipLimits, unpack_zip
 from morphgen.grammar.library import default_library
@@ -72,13 +69,12 @@ def test_a_release_holds_its_descriptions_and_hashes(report, folder):
     sums = read_sums(folder / SUMS_FILE)
     assert {path.partition("/")[0] for path in sums} == {
         *("README.md", "LICENCES.md", "build.json", "croissant.json", "licences.json"),
-        *("release.json", "robots", "robots.jsonl", "split.yaml", "tokens.npz", "difficulty.csv"),
+        *("release.json", "robots", "robots.jsonl", "split.yaml", "tokens.npz"),
     }
     release = read_release(folder)
     assert (release.name, release.version) == ("mine/some", "1.2.0")
     assert release.id == split_id(combined())
     assert release.evaluation == EvalProtocol().as_data(combined())
-    assert set(release.difficulty["nearest"]) == {"planar-plane"}
     _, front, text = (folder / "README.md").read_text().split("---\n", 2)
     card = yaml.safe_load(front)
     assert (card["license"], card["size_categories"]) == ("mit", ["n<1K"])
@@ -90,81 +86,14 @@ def test_a_release_holds_its_descriptions_and_hashes(report, folder):
     }
 
 
-def test_a_release_has_the_difficulty_of_every_robot(tmp_path, report, folder):
-    text = difficulty_csv(split_difficulty(combined(), LIBRARY))
-    assert (folder / DIFFICULTY_FILE).read_text() == text
-    card = (folder / "README.md").read_text()
-    assert re.search(r"\| planar-plane +\| test +\| push +\| 3 +\| ", card)
-    assert "gantry-plane " not in card.partition("## Difficulty")[2].partition("planar-plane")[0]
-    assert re.search(r"^morphgen train .*--sim mujoco\b", card, re.MULTILINE)
-    results = {"random": {("test", "planar-plane"): BaselineResult(1.5, 0.25)}}
-    request = replace(LIGHT, protocol=EvalProtocol("pybullet"))
-    more = release_split(combined(), tmp_path / "out", LIBRARY, request, results=results)
-    unpack_zip(more.archive, tmp_path / "out", LIMITS)
-    folder = tmp_path / "out" / "mine-some-1.2.0"
-    header, *_, last = (folder / DIFFICULTY_FILE).read_text().splitlines()
-    assert header == f"{text.splitlines()[0]},random_score,random_success"
-    assert last == f"{text.splitlines()[-1]},1.500000,0.250000"
-    card = (folder / "README.md").read_text()
-    assert "| 1.5, 25% " in card
-    for command in ("train", "eval"):  # in the simulator of the evaluation
-        assert re.search(rf"^morphgen {command} .*--sim pybullet\b", card, re.MULTILINE)
-    assert verify(folder, LIBRARY).differences == ()
-
-
-def test_the_card_lists_a_bounded_number_of_test_robots(report, folder, monkeypatch):
-    monkeypatch.setattr(release_module, "MAX_ROWS", 1)
-    rows = split_difficulty(combined(), LIBRARY)
-    more = (*rows, replace(rows[-1], robot="another"))
-    text = release_module.card_text(combined(), read_release(folder), [], [], more)
-    assert "The table has 1 of 2 test robots." in text
-    assert "another" not in text
-
-
-def change_difficulty(folder, change):
-    """Replace the text of ``difficulty.csv`` and its checksum; None deletes both."""
-    path, sums = folder / DIFFICULTY_FILE, read_sums(folder / SUMS_FILE)
-    text = change(path.read_text())
-    if text is None:
-        path.unlink()
-        del sums[DIFFICULTY_FILE]
-    else:
-        path.write_text(text)
-        sums[DIFFICULTY_FILE] = hashlib.sha256(text.encode()).hexdigest()
+def test_releases_of_version_0_3_with_difficulty_pass_verify(folder):
+    data = json.loads((folder / RELEASE_FILE).read_text())
+    added = {RELEASE_FILE: json.dumps(data | {"difficulty": {}}), "difficulty.csv": "split,side\n"}
+    sums = read_sums(folder / SUMS_FILE)
+    for name, text in added.items():
+        (folder / name).write_text(text)
+        sums[name] = hashlib.sha256(text.encode()).hexdigest()
     (folder / SUMS_FILE).write_text(sums_text(sums))
-
-
-def test_releases_of_earlier_versions_have_no_difficulty_and_pass_verify(folder):
-    change_difficulty(folder, lambda text: None)
-    assert verify(folder, LIBRARY).differences == ()
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "why"),
-    [
-        ("planar-cube,push,false,3", "planar-cube,push,false,2", "line 3: movable_to_tool of "),
-        (r"(plane,push,[^c]*cube,)[\d.]+", r"\1nan", "cosine of planar-plane is 'nan', not '0."),
-        (r"(planar-plane,push,.*)planar-cube", r"\1gantry-plane", "workspace_nearest of planar-"),
-        (r"(planar-plane,push,.*)planar-cube", r"\1x" + "y" * 999, "planar-plane is 'xyyy"),
-        ("planar-cube,push,false", "planar-cube,push", "line 3 has 13 cells, not 14"),
-        (r"\n[^\n]*\n\Z", r"\n", "it has 3 robots, not 4"),
-        ("cosine_nearest", "cosine_farthest", "it has other columns; expected split, side, robot"),
-        (r"\A", "x" * 200_000, "cannot be read: field larger than field limit"),
-    ],
-)
-def test_verify_compares_the_difficulty(folder, old, new, why):
-    change_difficulty(folder, lambda text: re.sub(old, new, text, count=1, flags=re.MULTILINE))
-    first, *_ = verify(folder, LIBRARY).differences
-    assert first.where == DIFFICULTY_FILE
-    assert why in first.why
-    assert len(first.why) < 300
-
-
-def test_verify_accepts_another_nearest_robot_that_is_as_near_up_to_rounding(folder, monkeypatch):
-    pattern = r"(planar-plane,push,.*)planar-cube,[\d.]+$"
-    change_difficulty(folder, lambda text: re.sub(pattern, r"\1gantry-cylinder,0.75", text))
-    assert len(verify(folder, LIBRARY).differences) == 2
-    monkeypatch.setattr(release_module, "FITTED_TOLERANCE", 1.0)
     assert verify(folder, LIBRARY).differences == ()
 
 
@@ -209,7 +138,6 @@ def test_croissant_lists_the_files_that_are_there(folder):
     assert data["license"] == ["https://spdx.org/licenses/MIT.html"]
     files = [each for each in data["distribution"] if each["@type"] == "cr:FileObject"]
     assert all(sums[each["contentUrl"]] == each["sha256"] for each in files)
-    assert DIFFICULTY_FILE in {each["@id"] for each in files}
     sets = [each["@id"] for each in data["distribution"] if each["@type"] == "cr:FileSet"]
     assert sets == ["urdf"]  # a light build has no MJCF
 

@@ -123,7 +123,6 @@ split build some.yaml --light --picture => choose one of light and picture
 split build some.yaml --out file => cannot write to file/mine/some: Not a directory
 split build some.yaml --goal-seed 1 => --goal-seed: only with --goals
 split stats wrong.yaml => robot 'planar-cube': the library has no part 'cubw'
-split difficulty some.yaml --csv some.yaml => --csv some.yaml: expected a name that ends in .csv
 RELEASE interpolation/arm3/reach --out file => cannot write to file: file is a f
 goals nowhere.yaml => nowhere.yaml: no such file
 goals interpolation/arm3/reach --task reach => is for a robot; interpolation/arm3/reach is a split

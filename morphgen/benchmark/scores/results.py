@@ -1,8 +1,8 @@
 """Results of submissions, computed from the episodes: rankings, reference scores, tables of seeds.
 
-Reference scores are those of submissions in a release, and of the baselines of a study. In tables,
-scores of several seeds of a method stand in one row, whose intervals resample the seeds:
-interquartile means, success rates, and paired differences to a reference controller.
+Reference scores are those of submissions in a release. In tables, scores of several seeds of a
+method stand in one row, whose intervals resample the seeds: interquartile means, success rates, and
+paired differences to a reference controller.
 """
 
 from __future__ import annotations
@@ -22,25 +22,21 @@ import numpy as np
 
 from morphgen.benchmark.release import SCORES_FILE, SUBMISSIONS_DIR
 from morphgen.benchmark.scores.submission import (
-    EPISODES,
     EvalProtocol,
     Submission,
     check_submission,
     expected_robots,
-    name_of,
     read_submissions,
-    read_table,
     require_comparable,
     require_same_random,
     submission_from,
     submission_text,
 )
-from morphgen.benchmark.survey import BaselineResult, BaselineResults
-from morphgen.errors import BenchmarkError, nearest
+from morphgen.errors import BenchmarkError
 from morphgen.formats.data_files import read_json
 from morphgen.grammar.library import Library
 from morphgen.rl.agents import AGENTS
-from morphgen.rl.baselines import BASELINES, ZERO
+from morphgen.rl.baselines import ZERO
 from morphgen.rl.scores import SIDES as SIDE_NAMES
 from morphgen.rl.scores import (
     Interval,
@@ -273,10 +269,6 @@ class References:
         """Return the scores of the submissions."""
         return method_rows(self.submissions, self.random, "reference")
 
-    def results(self) -> BaselineResults:
-        """Return the results of the baselines, in the order of ``BASELINES``."""
-        return _baseline_results(self.submissions, self.random)
-
 
 def collect_references(
     paths: Sequence[Path], split: Split, protocol: EvalProtocol, library: Library, *, jobs: int = 1
@@ -337,46 +329,6 @@ def _path(submission: Submission) -> str:
     if submission.training_seed is not None:
         words.append(f"seed{submission.training_seed}")
     return f"{SUBMISSIONS_DIR}/{re.sub(r'[^A-Za-z0-9+_-]', '_', '-'.join(words))}.json"
-
-
-def _baseline_results(
-    submissions: Sequence[Submission], random: RandomScores | None
-) -> BaselineResults:
-    own = {name: each for name in BASELINES for each in submissions if _is_baseline(each, name)}
-    return {
-        name: {
-            (robot.side, robot.robot): BaselineResult(
-                float(np.mean(relative_scores(robot, random))), float(np.mean(robot.success))
-            )
-            for robot in submission.robots
-        }
-        for name, submission in own.items()
-    }
-
-
-def study_results(folder: Path, split: Split) -> BaselineResults:
-    """Return the results of the baselines of a study, in the order of ``BASELINES``."""
-    table = folder / EPISODES
-    if not table.is_file():
-        raise BenchmarkError(
-            f"{folder}: no {EPISODES}; expected the output folder of morphgen study"
-        )
-    baselines = [each for each in read_table(table) if _is_baseline(each, *BASELINES)]
-    own = {f"{table}: {name_of(each)}": each for each in baselines if each.split.name == split.name}
-    if not own:
-        others = {each.split.name for each in baselines}
-        raise BenchmarkError(
-            f"{folder}: no episodes of baselines on split {split.name!r}"
-            f"{nearest(split.name, others)}"
-        )
-    require_comparable(own)
-    for where, each in own.items():
-        if each.split.id != split_id(split):
-            raise BenchmarkError(
-                f"{where}: of other robots: split id {each.split.id}; expected {split_id(split)}, "
-                f"that of {split.name}; name a study of these robots"
-            )
-    return _baseline_results(list(own.values()), None)
 
 
 NOTE = (
