@@ -160,10 +160,8 @@ class GoalSet:
     """
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
-    start_belongs_to_goal: ClassVar[bool]
-    """Whether two goals are the same only if their start configurations are the same, too."""
     not_compared: ClassVar[frozenset[str]]
-    """Fields that an audit certifies, but does not compare with those of a set sampled anew."""
+    """Fields that are certified, but not compared with those of a set sampled anew."""
     robot: str
     """Name of the robot."""
     key: str

@@ -152,9 +152,7 @@ def test_a_split_is_chosen_written_built_audited_and_verified(tmp_path, monkeypa
     folder = split.build("data", light=True, goals=True, goal_seed=1)
     built = morphgen.split(folder)
     assert (built.verify(), split.verify()) == ((), ())
-    codes = {finding.code for finding in built.audit().findings}
-    assert "goals-seed" not in codes
-    assert "goals-seed" in {finding.code for finding in built.audit(goal_seed=2).findings}
+    assert built.audit().passed()
     with pytest.raises(MorphgenError, match="was built with goals: ask for goals"):
         split.build("data", light=True)
     (folder / "robots" / split.test[0].name / "robot.urdf").write_text("<robot/>")

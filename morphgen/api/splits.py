@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, overload
 
 from morphgen.arguments import checked_signature, path_argument, text_argument, truth, whole_number
-from morphgen.benchmark.audit import Audit, audit_with_goals
+from morphgen.benchmark.audit import Audit, audit
 from morphgen.benchmark.generate import (
     SplitRequest,
     composition,
@@ -127,33 +127,19 @@ class LoadedSplit:
         self,
         *,
         near: NearThresholds = NEAR_THRESHOLDS,
-        goals: bool = False,
-        goal_seed: int | None = None,
         jobs: int = 1,
     ) -> Audit:
-        """Find leaks between train and test robots, and between the goal sets of a built split.
-
-        See ``morphgen.benchmark.audit.audit`` and ``morphgen.benchmark.audit.audit_goals``.
+        """Find leaks between train and test robots; see ``morphgen.benchmark.audit.audit``.
 
         Args:
             near: Thresholds of near duplicates.
-            goals: Whether to audit goal sets even if the split ships none.
-            goal_seed: Seed that the goal sets must have; by default that of the shipped ones, or 0.
             jobs: Number of processes.
 
         Raises:
             BenchmarkError: If the provenance of the split is malformed.
             MissingDependencyError: If a part's primitives must be fitted, and ``fit`` is missing.
         """
-        return audit_with_goals(
-            self.definition,
-            self.library,
-            self.folder,
-            near=near,
-            goals=goals,
-            goal_seed=goal_seed,
-            jobs=jobs,
-        )
+        return audit(self.definition, self.library, near=near, jobs=jobs)
 
     def write(self, path: str | PathLike[str] = ".") -> Path:
         """Write the split's file.

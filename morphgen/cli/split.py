@@ -69,7 +69,7 @@ def audit(args: argparse.Namespace) -> int:
     """Audit a split and print the findings."""
     near, split = _near(args.near), open_split(args.split, library=args.library)
     with bar(args, "auditing"):
-        result = split.audit(near=near, goals=args.goals, goal_seed=args.goal_seed, jobs=args.jobs)
+        result = split.audit(near=near, jobs=args.jobs)
     passed = result.passed(strict=args.strict)
     try:
         parts = split.licences()
@@ -114,8 +114,6 @@ def _audit_text(result: Audit, passed: bool, limits: str) -> str:
     for code, findings in _by_code([finding for finding, _ in result.accepted]).items():
         lines.append(f"accepted {code} ({len(findings)}): {reasons[code]}")
         lines += _listed(findings)
-    if result.goals:
-        lines.append("{sets} goal sets were audited, seed {seed}".format_map(result.goals))
     if limits:
         lines.append(limits)
     counts = opt.severity_counts(result.findings, ("error", "warning"))

@@ -59,7 +59,6 @@ _PLACED = 1e-6  # largest height of an object above the ground [m]
 class ArticulatedStartSet(GoalSet):
     """Starts of a robot's episodes with an articulated object, which stands at one place."""
 
-    start_belongs_to_goal: ClassVar[bool] = True
     not_compared: ClassVar[frozenset[str]] = frozenset(("robot", "distance", "path"))
 
     robot: str

@@ -90,16 +90,6 @@ class SplitGoals:
     sets: Mapping[tuple[Side, str], GoalResult]
     """Results with a goal set, by side and name of the member."""
 
-    @classmethod
-    def from_results(cls, results: Sequence[GoalResult], config: GoalConfig) -> SplitGoals:
-        """Collect the results that have a goal set."""
-        return cls(config, {(r.side, r.robot): r for r in results if r.side and r.goals})
-
-    def get(self, side: Side, name: str) -> GoalSet | None:
-        """Return a member's goal set, or None."""
-        result = self.sets.get((side, name))
-        return result.goals if result else None
-
 
 def certify_goal_set(goals: GoalSet, spec: EnvSpec) -> tuple[str, ...]:
     """Test the goals of a set among its own obstacles; return their faults, a line each."""
@@ -231,7 +221,8 @@ def _parse_index(index: Mapping[str, Any], folder: Path) -> SplitGoals:
         index[record["task"]]  # a KeyError if it is missing
     constants = {key: index[key] for key in index if key not in ("format", "seed", "sets")}
     config = GoalConfig(int(index["seed"]), task_configs(constants))
-    return SplitGoals.from_results([_read_set(folder, record) for record in index["sets"]], config)
+    results = [_read_set(folder, record) for record in index["sets"]]
+    return SplitGoals(config, {(r.side, r.robot): r for r in results if r.side})
 
 
 def _read_set(folder: Path, record: Mapping[str, Any]) -> GoalResult:

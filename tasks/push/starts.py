@@ -339,7 +339,6 @@ class PushStartSet(GoalSet):
     See ``GoalSet`` for the fields that all tasks have.
     """
 
-    start_belongs_to_goal: ClassVar[bool] = True
     not_compared: ClassVar[frozenset[str]] = frozenset(("robot", "behind", "across"))
 
     robot: str

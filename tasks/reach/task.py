@@ -44,7 +44,6 @@ EXACT = 1e-6
 class ReachGoalSet(GoalSet):
     """Goals of a robot, which are also its starts, and its obstacles; see ``GoalSet``."""
 
-    start_belongs_to_goal: ClassVar[bool] = False
     not_compared: ClassVar[frozenset[str]] = frozenset(("robot",))
 
     robot: str

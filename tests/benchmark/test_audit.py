@@ -159,6 +159,13 @@ def test_a_declared_similarity_bound_is_checked():
         audit(combined(provenance={"similarity": "small"}), LIBRARY)
 
 
+def test_a_task_that_no_package_has_is_an_error():
+    odd = split([member(TRAIN[0], task="rech")], [member(TEST[0], task="reach")])
+    (finding,) = [each for each in audit(odd, LIBRARY).findings if each.code == "task-unknown"]
+    assert (finding.where, finding.severity) == ("train robot gantry-plane", "error")
+    assert "its task 'rech' is unknown; did you mean 'reach'?" in finding.why
+
+
 def test_accepting_one_finding_accepts_no_other():
     accepted = {"part-unseen": "on purpose"}
     only = audit(combined(test=["base=planar ee=sphere"], accepted=accepted), LIBRARY)

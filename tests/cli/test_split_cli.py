@@ -324,33 +324,8 @@ def reaching(**more):
     return combined(train=train, test=test, **more)
 
 
-def known(**more):
-    """A split with one robot on both sides."""
-    twin = member(TRAIN[0], "twin", task="reach")
-    return replace(reaching(**more), test=(*reaching().test, twin))
-
-
 @pytest.mark.usefixtures("goal_cache")
-def test_goal_seed_is_printed_stored_and_audited(run, ok, write):
+def test_goal_seed_is_printed_and_stored(ok, write):
     out = ok("split", "build", write(reaching()), "--light", "--goals", "--goal-seed", "7")
     assert out.splitlines()[1] == "4 goal sets, seed 7"
     assert {one.seed for one in read_goals("data/mine/some", "train").values()} == {7}
-    assert run("split", "audit", "data/mine/some")[0] == 0
-    code, out, _ = run("split", "audit", "data/mine/some", "--goal-seed", "0")
-    assert (code, "error goals-seed (4)" in out) == (1, True)
-    assert "its set was made with seed 7, the split's with 0" in out
-
-
-@pytest.mark.usefixtures("goal_cache")
-def test_goals_are_audited_only_if_stored_or_requested(run, write):
-    accepted = {"body-shared": "new goals", "combination-seen": "it is known"}
-    path = write(known(accepted=accepted))
-    assert run("split", "audit", path)[0] == 0
-    run("split", "build", path, "--light")
-    assert run("split", "audit", "data/mine/some")[0] == 0
-    for words in ((path, "--goals"), ("data/mine/some", "--goals")):
-        code, out, _ = run("split", "audit", *words)
-        assert code == 1
-        why = "  test robot twin: train robot gantry-plane has 100 of its 100 goals"
-        assert f"error goals-shared (1)\n{why}\n" in out
-        assert "5 goal sets were audited, seed 0" in out
