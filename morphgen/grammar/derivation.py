@@ -83,34 +83,11 @@ def outline(derivation: Derivation) -> str:
     return "\n".join(_outline(derivation, "", 0))
 
 
-def difference(a: Derivation, b: Derivation) -> list[str]:
-    """Return the differences of two derivations, one line each; empty if they are equal."""
-    facts = {"-": _flat(a), "+": _flat(b)}
-    return [
-        f"{sign} {key} = {side[key]}"
-        for key in dict.fromkeys((*facts["-"], *facts["+"]))
-        if facts["-"].get(key) != facts["+"].get(key)
-        for sign, side in facts.items()
-        if key in side
-    ]
-
-
 def _outline(node: Derivation, port: str, depth: int) -> Iterator[str]:
     alone = Derivation(node.label, node.part, node.parameters)
     yield "  " * depth + (f"{port}: " if port else "") + str(alone)
     for name, child in node.children:
         yield from _outline(child, name, depth + 1)
-
-
-def _flat(derivation: Derivation) -> dict[str, str]:
-    """Return the part and port of each label, and the value of each ``label.parameter``."""
-    facts: dict[str, str] = {derivation.label: derivation.part}
-    for node in derivation.walk():
-        for name, value in node.parameters:
-            facts[f"{node.label}.{name}"] = format_number(value)
-        for port, child in node.children:
-            facts[child.label] = f"{child.part} on {node.label}:{port}"
-    return facts
 
 
 @lru_cache(maxsize=1)

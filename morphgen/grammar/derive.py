@@ -62,32 +62,22 @@ class RandomChooser(Chooser):
 
 @dataclass
 class RecordedChooser(Chooser):
-    """Repeats recorded choices where they are valid, and records all choices made."""
+    """Records the choices of another chooser."""
 
-    fallback: Chooser  # makes the choices that are not recorded or not valid
-    recorded: Choices = field(default_factory=dict)  # choices to repeat
+    chooser: Chooser
     choices: dict[str, float] = field(default_factory=dict)  # all choices made so far
 
     def alternative(self, key: str, weights: list[float]) -> int:
-        """Return the recorded index if it exists."""
-        index = self.recorded.get(key, -1)
-        if index not in range(len(weights)):
-            index = self.fallback.alternative(key, weights)
-        return int(self._record(key, index))
+        """Return the index of the other chooser."""
+        return int(self._record(key, self.chooser.alternative(key, weights)))
 
     def count(self, key: str, low: int, high: int) -> int:
-        """Return the recorded count if it is in range."""
-        count = self.recorded.get(key, -1)
-        if count not in range(low, high + 1):
-            count = self.fallback.count(key, low, high)
-        return int(self._record(key, count))
+        """Return the count of the other chooser."""
+        return int(self._record(key, self.chooser.count(key, low, high)))
 
     def value(self, key: str, distribution: Distribution) -> float:
-        """Return the recorded value if the distribution contains it."""
-        value = distribution.closest(self.recorded[key]) if key in self.recorded else None
-        if value is None:
-            value = self.fallback.value(key, distribution)
-        return self._record(key, float(format_number(value)))  # as a file would hold it
+        """Return the value of the other chooser, as a file would hold it."""
+        return self._record(key, float(format_number(self.chooser.value(key, distribution))))
 
     def _record(self, key: str, value: float) -> float:
         if key in self.choices:

@@ -51,15 +51,6 @@ class Distribution:
             case _:
                 return low
 
-    def closest(self, value: float) -> float | None:
-        """Return the possible value that equals ``value`` to 11 digits, or None."""
-        low, high = self.bounds
-        if self.kind == "choice":
-            closest = min(self.arguments, key=lambda choice: abs(choice - value))
-        else:
-            closest = min(max(round(value) if self.kind == "randint" else value, low), high)
-        return closest if math.isclose(closest, value, rel_tol=1e-11, abs_tol=1e-12) else None
-
     def draw(self, uniform: Callable[[], float], normal: Callable[[], float]) -> float:
         """Draw a value."""
         low, high = self.bounds

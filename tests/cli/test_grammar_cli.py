@@ -1,4 +1,4 @@
-"""``morphgen sample``, ``grammar``, ``derive``, ``mutate`` and grammars in ``compose``."""
+"""``morphgen sample``, ``grammar`` and grammars in ``compose``."""
 
 import json
 import re
@@ -157,79 +157,6 @@ def test_grammar_print_is_a_grammar_without_includes(run, ok, mine):
     assert run("grammar", "print", mine)[1] == out
 
 
-def test_derive_prints_one_line_per_part(run, cubes):
-    code, out, _ = run("derive", cubes / "cubes-000001")
-    assert (code, out.count("\n"), out.startswith("cubes=cubes(size=")) == (0, 1, True)
-    text = json.loads(run("derive", cubes / "cubes-000001", "--json")[1])
-    assert text == (cubes / "cubes-000001" / "derivation.txt").read_text().strip()
-
-
-def test_derive_takes_words(run):
-    assert run("derive", "arm=ur5", "ee=plane")[:2] == run("derive", "ur5-plane")[:2]
-
-
-@pytest.mark.parametrize("geometry", ["primitive", "sphere"])
-def test_derive_reproduces_fitted_collision_shapes(run, geometry):
-    words = ("--geometry", geometry, "--no-picture")
-    assert run("compose", "base=gantry", "ee=plane", "--name", "it", *words)[0] == 0
-    same = "robots/it/robot.urdf: the same bytes\n"
-    assert run("derive", "robots/it", "--replay") == (0, same, "")
-
-
-@pytest.mark.parametrize("light", [True, False])
-@pytest.mark.parametrize("category", ["chain", "panda_variations"])
-def test_derive_reproduces_the_same_bytes(run, light, category):
-    words = ("--light",) if light else ("--no-picture",)
-    assert run("sample", category, "-n", 2, "--out", "set", *words)[0] == 0
-    folder = Path("set") / f"{category}-000001"
-    assert run("derive", folder, "--replay") == (0, f"{folder}/robot.urdf: the same bytes\n", "")
-    text = (folder / "robot.urdf").read_text()
-    (folder / "robot.urdf").write_text(text.replace("<link", "<link ", 1))
-    assert run("derive", folder, "--replay") == (1, f"{folder}/robot.urdf: other bytes\n", "")
-    code, out, _ = run("derive", folder, "--replay", "--json")
-    assert (code, json.loads(out)) == (1, {"same": False})
-
-
-def test_mutate_writes_neighbours_and_prints_their_changes(ok, cubes):
-    words = ("mutate", cubes / "cubes-000002", "-n", 2, "--seed", 1, "--no-picture")
-    out = ok(*words)
-    for index, line in enumerate(out.splitlines()):
-        folder, what = line.split(": ")
-        assert folder.endswith(f"set-mutants-1/cubes-000002-m{index:04d}")
-        assert what.startswith("- cubes.size = ")
-        assert read_bundle(Path(folder)).dof == 2
-    again = ok(*words, "--json", "--out", "other")
-    assert [lines[0] + "; " + lines[1] for lines in json.loads(again).values()] == [
-        line.split(": ")[1] for line in out.splitlines()
-    ]
-
-
-def test_neighbours_meet_the_conditions_of_the_set(run, ok):
-    assert (
-        run("sample", "cubes", "-n", 1, "--light", "--where", "mass > 0.9", "--out", "set")[0] == 0
-    )
-    folders = json.loads(ok("mutate", "set/cubes-000000", "-n", 4, "--no-picture", "--json"))
-    assert all(read_bundle(Path(folder)).mass > 0.9 for folder in folders)
-
-
-@pytest.mark.parametrize(
-    ("where", "refusal"),
-    [
-        (None, "set/set.json: where: expected a list of conditions, not None"),
-        ([1], "set/set.json: where: expected a list of conditions, not [1]"),
-        (["mas > 1"], "unknown property 'mas'"),
-    ],
-)
-def test_mutate_refuses_settings_with_other_conditions(refused, cubes, where, refusal):
-    settings = json.loads((cubes / "set.json").read_text())
-    (cubes / "set.json").write_text(json.dumps({**settings, "where": where}))
-    assert refusal in refused("mutate", cubes / "cubes-000002", "--no-picture")
-
-
-def test_mutate_rejects_robots_missing_from_the_index(refused, cubes):
-    assert "'cubes-000009' is not in the index of" in refused("mutate", cubes / "cubes-000009")
-
-
 def test_compose_follows_a_grammar(run):
     code, out, _ = run("compose", "chain", "beads=5", "bead.radius=0.02", "--no-picture")
     assert (code, out.splitlines()[0].split(": ")[1][:16]) == (0, "19 links, 13 DoF")
@@ -253,4 +180,3 @@ def test_parts_and_grammars_are_read_from_the_user_library(run, monkeypatch, by_
     assert run("sample", "held", "-n", 2, "--light", *words)[0] == 0
     derivation = Path("robots/held/held-000001/derivation.txt").read_text()
     assert "flange: pincer=pincer(length=0." in derivation
-    assert run("derive", "robots/held/held-000001", "--replay", *words)[0] == 0

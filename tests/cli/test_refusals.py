@@ -93,11 +93,6 @@ similarity a b --measure cosin => argument --measure: invalid choice: 'cosin'; d
 sample cubse => unknown grammar 'cubse'; did you mean 'cubes'? valid: arm3, arm5
 sample cubes --seed -1 => argument --seed: -1: expected
 sample cubes --where mas<3 => --where:1:1: unknown property 'mas'; did you mean 'mass'
-derive nowhere => robot 'nowhere': there is no such bundle or URDF, and 'nowhere' is
-derive ur5-plane ur10-plane => ur5-plane and ur10-plane: expected one robot
-derive ur5-plane --replay => --replay: ur5-plane has no URDF yet; expected a robot's
-mutate nowhere/robot => nowhere/robot: no such file or folder
-mutate . => is not in a set made by morphgen sample (no
 trian => argument COMMAND: invalid choice: 'trian'; did you mean 'train'?
 split shw => argument COMMAND: invalid choice: 'shw'; did you mean 'show'?
 split new interpolatoin => 'interpolatoin'; did you mean 'interpolation'? valid: 
@@ -414,7 +409,6 @@ def test_commands_refuse_the_grammars_that_check_refuses(text, run, refused):
         ["grammar", "enumerate", "mine.grammar"],
         ["sample", "mine.grammar", "-n", 1, "--out", "out"],
         ["compose", "mine.grammar"],
-        ["derive", "mine.grammar"],
         ["split", "new", "interpolation", "--grammar", "mine.grammar", "--out", "s.yaml"],
     ):
         assert fault in refused(*command)

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers.grammars import CATEGORIES, LIBRARY, grammar, shipped
+from helpers.grammars import LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError, MorphgenError
-from morphgen.grammar.derivation import Derivation, difference, outline, parse_derivation
+from morphgen.grammar.derivation import Derivation, outline, parse_derivation
 from morphgen.grammar.derive import (
     Chooser,
     RandomChooser,
@@ -146,26 +146,6 @@ def test_repetition_counts_are_uniform():
     assert [counts.count(n) / 900 for n in (2, 3, 4)] == pytest.approx([1 / 3] * 3, abs=0.05)
 
 
-@pytest.mark.parametrize("name", CATEGORIES)
-def test_recorded_choices_reproduce_the_derivation(name):
-    grammar = shipped(name)
-    for seed in range(5):
-        recorded = RecordedChooser(RandomChooser(np.random.default_rng(seed)))
-        tree = derive(grammar, LIBRARY, recorded)
-        written = {key: float(f"{value:.12g}") for key, value in recorded.choices.items()}
-        again = RecordedChooser(Chooser(), written)
-        assert derive(grammar, LIBRARY, again) == tree
-        assert again.choices == recorded.choices
-
-
-def test_invalid_recorded_choices_fall_back_to_the_other_chooser():
-    links = "links -> beam(length=uniform(0.1, 0.5)){2,4} | jaw"
-    robot_grammar = grammar("robot -> post links", links)
-    given = {"robot/1.links": 7.0, "robot/1.links/0.beam#": 9.0, "nowhere": 1.0}
-    repeated = derive(robot_grammar, LIBRARY, RecordedChooser(Chooser(), given))
-    assert repeated == derive(robot_grammar, LIBRARY, Chooser())
-
-
 def test_a_recursion_may_terminate():
     robot_grammar = grammar("robot -> slides tail", "tail -> bead | bead tail")
     assert {2, 3, 4} <= {len(labels(draw(robot_grammar, seed))) for seed in range(30)}
@@ -249,15 +229,6 @@ def test_printing_and_parsing_a_derivation_round_trips(tree):
 def test_invalid_derivations_are_errors_with_a_position(text):
     with pytest.raises(GrammarError, match=r"^card:1:\d+: invalid derivation"):
         parse_derivation(text, "card")
-
-
-def test_a_difference_lists_parts_and_parameters():
-    a = parse_derivation("base=fixed[top: arm=ur5[flange: ee=plane(size=0.1)]]")
-    b = parse_derivation("base=fixed[top: arm=ur5[flange: ee=plane(size=0.2)]]")
-    c = parse_derivation("base=fixed[top: arm=panda]")
-    assert difference(a, a) == []
-    assert difference(a, b) == ["- ee.size = 0.1", "+ ee.size = 0.2"]
-    assert difference(a, c)[:2] == ["- arm = ur5 on base:top", "+ arm = panda on base:top"]
 
 
 def test_an_outline_has_one_line_per_part():

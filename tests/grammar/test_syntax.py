@@ -48,7 +48,6 @@ from morphgen.grammar.syntax import (
 from morphgen.grammar.values import (
     DISTRIBUTIONS,
     PROPERTIES,
-    Distribution,
     RobotProperties,
     Scope,
     clauses,
@@ -297,23 +296,6 @@ def test_a_normal_is_clipped_not_redrawn():
 )
 def test_the_typical_value_is_the_middle_or_the_first(text, typical):
     assert value(text)[0] == pytest.approx(typical)
-
-
-@pytest.mark.parametrize(
-    ("distribution", "asked", "given"),
-    [
-        (Distribution("choice", (math.pi / 6, math.pi / 3)), 1.0471975512, math.pi / 3),
-        (Distribution("choice", (0.0, 1.0)), 0.5, None),
-        (Distribution("normal", (0.0, 1.0, 0.0, 2 / 3)), 0.666666666667, 2 / 3),
-        (Distribution("uniform", (0.0, 1.0)), 0.25, 0.25),
-        (Distribution("uniform", (0.0, 1.0)), 1.1, None),
-        (Distribution("randint", (2.0, 5.0)), 3.0, 3),
-        (Distribution("randint", (2.0, 5.0)), 2.5, None),
-        (Distribution("randint", (2.0, 5.0)), 6.0, None),
-    ],
-)
-def test_a_value_rounded_for_a_file_is_recognized(distribution, asked, given):
-    assert distribution.closest(asked) == given
 
 
 def true_of(text, robot):
