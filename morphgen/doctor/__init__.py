@@ -1,4 +1,4 @@
-"""Diagnosis of an installation: versions, optional packages, files, caches and a self-test."""
+"""Diagnosis of an installation: versions, optional packages, files and caches."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from morphgen.extras import missing_extra
 SECTIONS: Mapping[str, tuple[str, str]] = {
     "system": ("morphgen.doctor.system", "machine"),
     "packages": ("morphgen.doctor.system", "packages"),
-    "files": ("morphgen.doctor.self_test", "files"),
-    "self-test": ("morphgen.doctor.self_test", "self_test"),
+    "files": ("morphgen.doctor.files", "files"),
 }
 """Module and function of each section; the function yields the results."""
 
@@ -25,7 +24,7 @@ Status = Literal["ok", "absent", "warning", "error"]
 class Entry:
     """One result."""
 
-    name: str  # name of what was examined, such as `simulator mujoco`
+    name: str  # name of what was examined, such as `goal sets`
     status: Status
     """``absent`` for an optional package, ``error`` if morphgen does not work as documented."""
     text: str  # result, and what to do about it if it is not `ok`; one line

@@ -8,18 +8,16 @@ import re
 import shutil
 from dataclasses import asdict
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from packaging.requirements import Requirement
 
-import morphgen
 from morphgen import doctor
 from morphgen.benchmark import release, split_folder
 from morphgen.benchmark.scores import submission
 from morphgen.cli import main
-from morphgen.doctor import SECTIONS, Entry, attempt, diagnose, self_test, system
+from morphgen.doctor import SECTIONS, Entry, attempt, diagnose, files, system
 from morphgen.encoding.robot_hash import digest, robot_hash
 from morphgen.encoding.tokens import FREQUENCIES, KINDS, LAYOUT, MAX_LINKS, SHAPES, tokens
 from morphgen.errors import MissingDependencyError, PartError
@@ -47,7 +45,7 @@ from morphgen.splits.split import split_id
 from morphgen.splits.split_file import read_split, split_names
 from morphgen.tasks.goals import split_goals
 from morphgen.tasks.goals.goal_sets import FOLDER, INDEX
-from morphgen.tasks.registry import SIMULATORS, TASKS
+from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP
 
 
@@ -61,22 +59,12 @@ def only(entries, monkeypatch):
     monkeypatch.setattr(doctor, "SECTIONS", {"part": SECTIONS["system"]})
 
 
-def broken():
-    raise OSError("libGL.so.1: cannot open shared object file")
-
-
-@pytest.fixture
-def ur5_plane():
-    return morphgen.compose("ur5-plane")
-
-
 def test_this_installation_is_sound(capsys):
     assert main(["doctor"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line for line in lines if not line.startswith(" ")][:-1] == list(SECTIONS)
     names = {line.split(": ")[0].split(maxsplit=1)[1] for line in lines if line.startswith(" ")}
-    assert {f"simulator {name}" for name in SIMULATORS} < names
-    assert {"core", "extra fit", "cache", "gpu", "loader pinocchio", "film"} < names
+    assert {"core", "extra fit", "cache", "gpu", "splits", "policies"} < names
     assert lines[-1].startswith("sound: ")
 
 
@@ -181,71 +169,40 @@ def test_a_cache_that_cannot_be_written_is_a_warning(tmp_path, monkeypatch):
 def test_folders_of_the_user_are_named(tmp_path, monkeypatch):
     monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path))
     monkeypatch.setenv("ROS_PACKAGE_PATH", "/opt/ros")
-    entries = by_name(self_test.files())
+    entries = by_name(files.files())
     assert f"0 of them in {tmp_path} ({LIBRARY_VARIABLE})" in entries["library"].text
     assert entries["ROS_PACKAGE_PATH"].text.startswith("/opt/ros; ")
     assert {entry.status for entry in entries.values()} == {"ok"}
     (tmp_path / "broken.yaml").write_text("name: ]")
-    library = by_name(self_test.files())["library"]
+    library = by_name(files.files())["library"]
     assert library.status == "warning"
     assert f"; left out: {tmp_path}/broken.yaml:1:7: invalid YAML" in library.text
     monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path / "none"))
-    library = by_name(self_test.files())["library"]
+    library = by_name(files.files())["library"]
     assert library.status == "error"
     assert f"does not exist; change {LIBRARY_VARIABLE}=" in library.text
 
 
 def test_data_packages_of_another_version_and_missing_files_are_found(monkeypatch):
     monkeypatch.setattr(catalogue, "_version", lambda package: "9.9")
-    entry = by_name(self_test.files())["robots of rtb-data"]
+    entry = by_name(files.files())["robots of rtb-data"]
     assert (entry.status, len(entry.data["changed"])) == ("warning", entry.data["parts"])
 
     def missing(package, file):
         raise PartError(f"{package} has no file {file}")
 
-    monkeypatch.setattr(self_test, "distribution_file", missing)
-    entry = by_name(self_test.files())["robots of rtb-data"]
+    monkeypatch.setattr(files, "distribution_file", missing)
+    entry = by_name(files.files())["robots of rtb-data"]
     assert (entry.status, "parts lack their file: rtb-data has no" in entry.text) == ("error", True)
 
 
 def test_damaged_goal_sets_are_an_error(tmp_path, monkeypatch):
-    folder = shutil.copytree(self_test.FOLDER, tmp_path / "sets")
-    monkeypatch.setattr(self_test, "FOLDER", folder)
+    folder = shutil.copytree(files.FOLDER, tmp_path / "sets")
+    monkeypatch.setattr(files, "FOLDER", folder)
     damaged = next(folder.glob("*.xz"))
     damaged.write_bytes(damaged.read_bytes()[:-1])
-    sets = by_name(self_test.files())["goal sets"]
+    sets = by_name(files.files())["goal sets"]
     assert (sets.status, sets.data["damaged"]) == ("error", [damaged.name])
-
-
-def test_a_simulator_that_does_not_move_is_an_error(ur5_plane, monkeypatch):
-    kinematic = SIMULATORS["kinematic"]
-
-    def load(*args):
-        simulation = kinematic.load(*args)
-        simulation.step = lambda targets: None
-        return simulation
-
-    still = SimpleNamespace(load=load, devices=("cpu",))
-    monkeypatch.setitem(SIMULATORS._loaded, "kinematic", still)
-    entry = self_test._simulator("it", "kinematic", ur5_plane)
-    assert (entry.status, entry.data) == ("error", {"moved": 0.0})
-
-
-def test_without_drawing_there_are_warnings_only(monkeypatch):
-    monkeypatch.setattr(self_test, "render", lambda *_, **__: broken())
-    monkeypatch.setattr(self_test, "gl_context", lambda *_: broken())
-    monkeypatch.setattr(self_test, "SIMULATORS", ())  # they and the loaders take seconds
-    monkeypatch.setattr(self_test, "_loaders", lambda *_: ())
-    entries = by_name(self_test.self_test())
-    warnings = {name for name, entry in entries.items() if entry.status == "warning"}
-    assert warnings == {"picture", "film"}
-    assert "libGL.so.1" in entries["film"].text
-
-
-def test_without_its_robot_the_self_test_stops(monkeypatch):
-    monkeypatch.setattr(self_test, "compose", lambda *_: broken())
-    (entry,) = self_test.self_test()
-    assert (entry.name, entry.status) == ("compose", "error")
 
 
 def test_an_error_that_a_package_made_of_ctrl_c_ends_the_diagnosis():
