@@ -171,9 +171,9 @@ def test_splits_of_every_regime_are_those_of_the_command_line(tmp_path, monkeypa
         (["composition", "--from", pattern, "--task", "push", "--obstacles"],
          {"regime": "composition", "robots": pattern, "task": "push", "obstacles": True}),
         (["extrapolation", "--train-category", "stick,nlink", "--test-category", "chain",
-          "--train", "2,4", "--max-links", "25", "--similarity", "<0.9"],
+          "--train", "2,4", "--max-links", "25"],
          {"regime": "extrapolation", "train_category": ["stick", "nlink"], "train": [2, 4],
-          "test_category": "chain", "max_links": 25, "similarity": "<0.9"}),
+          "test_category": "chain", "max_links": 25}),
     ):  # fmt: skip
         assert main(["split", "new", *words, "--out", "cli"]) == 0
         splits = morphgen.split(**arguments)

@@ -18,7 +18,6 @@ from morphgen.benchmark.generate import (
     composition,
     extrapolation,
     interpolation,
-    parse_bound,
 )
 from morphgen.benchmark.hold_out import hold_out
 from morphgen.benchmark.licences import LicencedPart, licenced_parts
@@ -240,7 +239,6 @@ class NewSplit(TypedDict, total=False):
     train_category: Names
     test_category: Names
     hull: str
-    similarity: str
     test: int
     task: Names
     obstacles: bool
@@ -312,7 +310,7 @@ def split(
               (``arm=ur5+ee=plane``)
             - ``regime``: ``interpolation`` with ``grammar`` and ``hull`` (``inside``, ``outside``
               or ``any``); ``composition`` with ``robots``; ``extrapolation`` with
-              ``train_category``, ``test_category`` (grammars) and ``similarity`` (``<0.6``)
+              ``train_category`` and ``test_category`` (grammars)
             - ``robots``: words of ``compose`` with choices in braces and wildcards, by default
               ``arm=* ee=*``; ``grammar``: grammars to draw from
             - ``test``: number of test robots, by default 1; ``task``: by default ``reach``;
@@ -356,7 +354,7 @@ def split(
 _RULES: Mapping[Regime, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "interpolation": (("grammar",), ("hull",)),
     "composition": (("robots",), ()),
-    "extrapolation": (("train_category", "test_category"), ("similarity",)),
+    "extrapolation": (("train_category", "test_category"), ()),
     "hold-out": (("hold_out",), ("robots", "grammar")),
 }
 """Arguments that a regime needs, and further ones that have an effect."""
@@ -446,9 +444,7 @@ def _choose(
         if regime == "composition":
             return composition(request, patterns, library, jobs=jobs)
         if regime == "extrapolation":
-            text = ",".join(rules.get("similarity", ()))
-            bound = parse_bound(text) if text else None
-            return extrapolation(request, train, test, library, similarity=bound, jobs=jobs)
+            return extrapolation(request, train, test, library, jobs=jobs)
         held_out = rules["hold_out"]
         return hold_out(request, held_out, library, patterns=patterns, grammars=grammars, jobs=jobs)
 

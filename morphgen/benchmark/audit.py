@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.benchmark.generate import parse_bound
 from morphgen.benchmark.hold_out import has_hold_out_rules, hold_out_findings
 from morphgen.benchmark.regimes import found, regime_findings
 from morphgen.benchmark.survey import (
@@ -74,7 +73,6 @@ def audit_survey(
         *_leaks(survey, near),
         *_repeated(split),
         *_regime_findings(survey, library),
-        *_bound_findings(survey),
         *_unknown_tasks(split),
     ]
     n = len(split.train)
@@ -169,19 +167,6 @@ def _regime_findings(survey: SplitSurvey, library: Library) -> tuple[Finding, ..
     if has_hold_out_rules(survey.split):
         return (*findings, *hold_out_findings(split, library))
     return findings
-
-
-def _bound_findings(survey: SplitSurvey) -> Iterator[Finding]:
-    """Yield test robots that violate the similarity bound that the split was made with."""
-    text = survey.split.provenance.get("similarity")
-    if text is None:
-        return
-    bound = parse_bound(str(text), f"split {survey.split.name!r}: made: similarity")
-    for member, cosines in zip(survey.split.test, survey.by_measure("cosine").T, strict=True):
-        largest = max(cosines[~np.isnan(cosines)].tolist(), default=None)
-        if largest is not None and not bound.holds(largest):
-            where = f"test robot {member.name}"
-            yield found("similarity-bound", where, cosine=largest, bound=bound)
 
 
 def _unknown_tasks(split: Split) -> Iterator[Finding]:

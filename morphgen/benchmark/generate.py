@@ -6,15 +6,14 @@
 from __future__ import annotations
 
 import itertools
-import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from morphgen.benchmark.regimes import HULLS, RuledRobot, pattern_robots, regime_violations
-from morphgen.encoding.similarity import cosine, is_near
+from morphgen.encoding.similarity import is_near
 from morphgen.encoding.tokens import MAX_LINKS, require_max_links
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.derivation import Derivation
@@ -105,8 +104,6 @@ class RobotStream:
             return None
 
 
-Reject = Callable[[Candidate, Sequence[Candidate]], str]
-"""Function that returns why a composed robot cannot be a test robot beside train robots."""
 _REASONS = {
     "structure-unseen": "a structure that no train robot has",
     "hull": "parameters on the other side of the hull of the train robots",
@@ -122,13 +119,12 @@ def _drawn_splits(
     streams: tuple[Sequence[RobotStream], Sequence[RobotStream]],
     factory: RobotFactory,
     provenance: Mapping[str, object],
-    reject: Reject,
-    advice: Callable[[], str],
+    advice: str,
     jobs: int,
 ) -> tuple[Split, ...]:
     """Return splits of robots that are taken from streams of train and test robots in turn.
 
-    advice: Returns what to change if a search finds too few robots.
+    advice: What to change if a search finds too few robots.
     """
     train_streams, test_streams = streams
     turns = (divmod(i, len(train_streams)) for i in range(request.train[-1]))
@@ -150,7 +146,7 @@ def _drawn_splits(
         if twin := name_by_hash.get(robot.hash):
             return f"the body of {twin}"
         # A robot has another derivation if the conditions of its grammar reject the first one.
-        reasons = (reject(robot, side) for side in sides)
+        reasons = (_near_reason(robot, side) for side in sides)
         return violated(robot.derivation) or next(filter(None, reasons), "")
 
     test: list[Candidate] = []
@@ -163,7 +159,7 @@ def _drawn_splits(
             raise BenchmarkError(
                 f"{', '.join(stream.grammar.name for stream in test_streams)}: {len(test)} of "
                 f"{request.test} test robots found in {rejected.total() + len(test)} draws; "
-                f"{count} had {reason}; {advice()}"
+                f"{count} had {reason}; {advice}"
             )
         number, stream = next(numbers)
         derivation = stream.derivation(number, library)
@@ -245,8 +241,7 @@ def interpolation(
         ([train], [test]),
         RobotFactory(library, with_features=True, max_links=request.max_links),
         {"grammar": {grammar.name: grammar.digest}, "hull": hull},
-        _near_reason,
-        lambda: advice[hull],
+        advice[hull],
         jobs,
     )
 
@@ -411,41 +406,12 @@ def _why_not(candidates: Sequence[RuledRobot], n: int, min_train: int, max_held:
     return f"{text}; give --from more choices, or ask for fewer robots"
 
 
-_BOUND = re.compile(r"\s*([<>])\s*(\d+\.?\d*|\.\d+)\s*")
-
-
-@dataclass(frozen=True)
-class Bound:
-    """Bound on the largest cosine similarity of a test robot to any train robot."""
-
-    is_upper: bool  # whether the cosine must be below `value`; above it otherwise
-    value: float
-
-    def __str__(self) -> str:
-        return f"{'<' if self.is_upper else '>'}{self.value:g}"
-
-    def holds(self, largest: float) -> bool:
-        """Test if the cosine to the nearest train robot meets the bound."""
-        return largest < self.value if self.is_upper else largest > self.value
-
-
-def parse_bound(text: str, origin: str = "--similarity") -> Bound:
-    """Read a bound such as ``<0.6``."""
-    match = _BOUND.fullmatch(text)
-    if match is None or float(match[2]) > 1:
-        raise BenchmarkError(
-            f"{origin} {text!r}: expected '<' or '>' and a number from 0 to 1, such as '<0.6'"
-        )
-    return Bound(match[1] == "<", float(match[2]))
-
-
 def extrapolation(
     request: SplitRequest,
     train_grammars: Sequence[Grammar],
     test_grammars: Sequence[Grammar],
     library: Library,
     *,
-    similarity: Bound | None = None,
     jobs: int = 1,
 ) -> tuple[Split, ...]:
     """Return splits whose test robots share no grammar and no structure with a train robot."""
@@ -459,41 +425,17 @@ def extrapolation(
         ", ".join(grammar.name for grammar in grammars)
         for grammars in (train_grammars, test_grammars)
     )
-    misses: list[tuple[float, str, str]] = []
-
-    def reject(robot: Candidate, train: Sequence[Candidate]) -> str:
-        if similarity is None or robot.features is None:
-            return ""
-        own = robot.features
-        cosines = [(cosine(own, each.features), each.name) for each in train if each.features]
-        value, nearest = max(cosines, key=lambda pair: pair[0])
-        if similarity.holds(value):
-            return ""
-        misses.append((value, robot.name, nearest))
-        return f"a cosine to the nearest train robot that is not {similarity}"
-
-    def advice() -> str:
-        if similarity is None or not misses:
-            return "choose other categories, or fewer test robots"
-        value, name, nearest = min(misses) if similarity.is_upper else max(misses)
-        return (
-            f"the nearest to the bound was {name}, with {value:.3f} to {nearest}: choose another "
-            "bound, or other categories"
-        )
-
     return _drawn_splits(
         request,
         "extrapolation",
         f"{{n}} robots of {sources}; test: {request.test} of {targets}",
         (train_streams, test_streams),
-        RobotFactory(library, with_features=similarity is not None, max_links=request.max_links),
+        RobotFactory(library, max_links=request.max_links),
         {
             "train_categories": {grammar.name: grammar.digest for grammar in train_grammars},
             "test_categories": {grammar.name: grammar.digest for grammar in test_grammars},
-            **({"similarity": str(similarity)} if similarity else {}),
         },
-        reject,
-        advice,
+        "choose other categories, or fewer test robots",
         jobs,
     )
 

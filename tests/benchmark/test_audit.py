@@ -148,17 +148,6 @@ def test_robots_that_cannot_be_composed_or_compared_are_reported(derivation, why
     assert why in broken.why
 
 
-def test_a_declared_similarity_bound_is_checked():
-    likeness = survey_split(combined(), LIBRARY).by_measure("cosine").max()
-    for bound, holds in (("<0.99", False), (">0.99", True), ("<1.0", True)):
-        example_split = combined(provenance={"similarity": bound})
-        codes = {code for code, _ in finding_keys(example_split)}
-        assert codes == (set() if holds else {"similarity-bound"})
-    assert 0.99 < likeness < 1
-    with pytest.raises(BenchmarkError, match=r"split 'mine/some': made: .*'<'"):
-        audit(combined(provenance={"similarity": "small"}), LIBRARY)
-
-
 def test_a_task_that_no_package_has_is_an_error():
     odd = split([member(TRAIN[0], task="rech")], [member(TEST[0], task="reach")])
     (finding,) = [each for each in audit(odd, LIBRARY).findings if each.code == "task-unknown"]

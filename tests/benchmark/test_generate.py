@@ -14,11 +14,9 @@ from helpers.grammars import grammar, shipped
 from morphgen.benchmark import generate
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.generate import (
-    Bound,
     composition,
     extrapolation,
     interpolation,
-    parse_bound,
 )
 from morphgen.benchmark.regimes import (
     ON_HULL,
@@ -30,16 +28,14 @@ from morphgen.benchmark.regimes import (
     structure,
 )
 from morphgen.encoding.robot_hash import robot_hash
-from morphgen.encoding.similarity import cosine, features
 from morphgen.errors import BenchmarkError
-from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.request import parse_words
 from morphgen.model.findings import Finding
 from morphgen.progress import show_progress
 from morphgen.splits import candidates
 from morphgen.splits.candidates import RobotFactory, SampledRecipe, recipe_of
-from morphgen.splits.split import Member, Split, compose_member
+from morphgen.splits.split import Member, Split
 
 
 def points(members):
@@ -175,28 +171,6 @@ def test_extrapolation_never_tests_trained_structures(monkeypatch):
         extrapolation(order(20), grammars("nlink"), [same], LIBRARY)
 
 
-def cosines(split):
-    """Return the cosine similarity of every test robot to every train robot."""
-    rows = []
-    for side in (split.test, split.train):
-        robots = [compose_member(member, LIBRARY) for member in side]
-        shapes = [token_shapes(robot, LIBRARY.folders) for robot in robots]
-        pairs = zip(robots, shapes, strict=True)
-        rows.append([features(*pair, max_links=split.max_links) for pair in pairs])
-    return np.array([[cosine(test, train) for train in rows[1]] for test in rows[0]])
-
-
-@pytest.mark.parametrize(("bound", "holds"), [("<0.55", np.less), (" > .55 ", np.greater)])
-def test_a_bound_on_similarity_holds_for_every_size(bound, holds):
-    wide, limit = replace(order(3, 9, test=2), max_links=25), parse_bound(bound)
-    sides = grammars(*CATEGORIES), grammars("chain")
-    splits = extrapolation(wide, *sides, LIBRARY, similarity=limit)
-    for split in splits:
-        nearest = cosines(split).max(axis=1)
-        assert holds(nearest, 0.55).all()
-        assert split.provenance["similarity"] == f"{bound.strip()[0]}0.55"
-
-
 def test_too_many_links_are_a_finding_unless_max_links_is_raised():
     wanted, sides = order(2, test=6), (grammars("stick"), grammars("chain"))
     with pytest.raises(BenchmarkError, match=r"robot 'chain-\d+' has 25 links, more than max_li"):
@@ -210,23 +184,6 @@ def test_too_many_links_are_a_finding_unless_max_links_is_raised():
     assert findings
     assert {each.why for each in findings} == {"it has 25 links, more than max_links 23"}
     assert all("--max-links" in each.fix for each in findings)
-
-
-def test_an_unsatisfiable_bound_is_an_error_that_names_the_nearest_value(monkeypatch):
-    monkeypatch.setattr(generate, "MAX_COMPOSED", 9)
-    sides, bound = (grammars("prims"), grammars("cubes")), Bound(True, 0.01)
-    with pytest.raises(BenchmarkError) as caught:
-        extrapolation(order(2), *sides, LIBRARY, similarity=bound)
-    text = str(caught.value)
-    assert text.startswith("cubes: 0 of 1 test robots found in 9 draws; 9 had a cosine to the ")
-    assert "not <0.01; the nearest to the bound was cubes-" in text
-    assert text.endswith(": choose another bound, or other categories")
-
-
-@pytest.mark.parametrize("text", ["0.6", "<", "<=0.6", "<6", "< nan", "", "<-1", "<0.6 0.7"])
-def test_invalid_bounds_are_errors(text):
-    with pytest.raises(BenchmarkError, match="expected '<' or '>' and a number from 0 to 1"):
-        parse_bound(text)
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,7 @@ def test_new_prints_a_summary_and_the_next_command(run, ok, tmp_path):
             *("hold-out-ee-plane-arm3.length-0.3..0.4-push-seed0", (2, 2)),
         ),
         (
-            *(EXTRAPOLATION, "--similarity <0.6 --test 2 --task reach,push"),
+            *(EXTRAPOLATION, "--test 2 --task reach,push"),
             *("extrapolation-chain-reach-push-seed0", (12, 4)),
         ),
     ],
