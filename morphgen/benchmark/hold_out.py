@@ -641,34 +641,6 @@ def hold_out_findings(split: Split, library: Library) -> Iterator[Finding]:
             yield found("held-out-untested", f"rule {rule}")
 
 
-def related_parts(split: Split, library: Library) -> dict[str, tuple[str, ...]]:
-    """Return train parts of the kind and manufacturer of parts that are held out by their names.
-
-    ``arm=kinova*`` does not hold out ``mico``, which is Kinova's, too: users may not expect that.
-    The parts are given by the rule that holds them out, such as ``arm.manufacturer=Kinova``.
-    """
-    named = [rule for rule in hold_out_rules(split, library) if rule.holds_out_parts]
-    held = {
-        part
-        for member in split.test
-        for part in held_out_parts(named, parse_derivation(member.derivation), library)
-    }
-    trained = {
-        part for member in split.train for part in parts(parse_derivation(member.derivation))
-    }
-    related: dict[str, tuple[str, ...]] = {}
-    for manifest in map(library.manifest, sorted(held)):
-        same = [
-            part
-            for part in sorted(trained)
-            if (library.manifest(part).kind, library.manifest(part).manufacturer)
-            == (manifest.kind, manifest.manufacturer)
-        ]
-        if manifest.manufacturer and same:
-            related[f"{manifest.kind}.manufacturer={manifest.manufacturer}"] = tuple(same)
-    return related
-
-
 DEFAULT_PATTERN = "arm=* ee=*"  # robots that are drawn from if nothing is named
 
 

@@ -132,17 +132,6 @@ def restriction_text(part: LicencedPart) -> str:
     )
 
 
-def restriction_line(parts: Iterable[LicencedPart]) -> str:
-    """Return the restricted parts, if any, in a line with what a release of them needs."""
-    limited = restricted(parts)
-    if not limited:
-        return ""
-    return (
-        f"restricted: {'; '.join(map(restriction_text, limited))}; split release needs "
-        f"--licence-allow {','.join(licence_ids(limited))}"
-    )
-
-
 def require_allowed(split: Split, parts: Iterable[LicencedPart], allowed: Collection[str]) -> None:
     """Require that every licence with restrictions is allowed by its identifier."""
     parts = tuple(parts)

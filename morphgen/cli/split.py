@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from morphgen.api.splits import DEFAULT_TRAIN, NewSplit
 from morphgen.api.splits import goals as sample_goals
@@ -17,13 +17,6 @@ from morphgen.api.splits import split as open_split
 from morphgen.benchmark import release as releases
 from morphgen.benchmark import split_folder, survey
 from morphgen.benchmark.audit import Audit
-from morphgen.benchmark.hold_out import related_parts
-from morphgen.benchmark.licences import (
-    licenced_parts,
-    restricted,
-    restriction_line,
-    restriction_text,
-)
 from morphgen.benchmark.scores import results as scores
 from morphgen.benchmark.scores.submission import (
     DEFAULT_EPISODES,
@@ -41,9 +34,8 @@ from morphgen.benchmark.survey import paper_row, statistics
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, status
 from morphgen.encoding.similarity import MEASURES, NEAR_THRESHOLDS, NearThresholds
-from morphgen.errors import BenchmarkError, GrammarError, PartError
+from morphgen.errors import BenchmarkError
 from morphgen.formats.files import require_writable_folder
-from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding
 from morphgen.rl.scores import POWER
 from morphgen.splits.split import HOLD_OUT, REGIMES, SIDES, Split, split_id
@@ -71,13 +63,8 @@ def audit(args: argparse.Namespace) -> int:
     with bar(args, "auditing"):
         result = split.audit(near=near, jobs=args.jobs)
     passed = result.passed(strict=args.strict)
-    try:
-        parts = split.licences()
-    except (GrammarError, PartError):  # the audit has a finding about it
-        parts = ()
-    limited = [part.as_dict() for part in restricted(parts)]
-    data = {**result.as_dict(), "restricted": limited, "passed": passed}
-    opt.print_result(args, data, lambda: _audit_text(result, passed, restriction_line(parts)))
+    data = {**result.as_dict(), "passed": passed}
+    opt.print_result(args, data, lambda: _audit_text(result, passed))
     return int(not passed)
 
 
@@ -100,7 +87,7 @@ def _near(text: str | None) -> NearThresholds:
     return near
 
 
-def _audit_text(result: Audit, passed: bool, limits: str) -> str:
+def _audit_text(result: Audit, passed: bool) -> str:
     rows = [
         (test, *(f"{found.train} {found.value:.3f}" for found in trains.values()))
         for test, trains in result.nearest.items()
@@ -114,8 +101,6 @@ def _audit_text(result: Audit, passed: bool, limits: str) -> str:
     for code, findings in _by_code([finding for finding, _ in result.accepted]).items():
         lines.append(f"accepted {code} ({len(findings)}): {reasons[code]}")
         lines += _listed(findings)
-    if limits:
-        lines.append(limits)
     counts = opt.severity_counts(result.findings, ("error", "warning"))
     verdict = "passed" if passed else "FAILED"
     lines.append(f"{result.split}: {verdict}: {counts}, {len(result.accepted)} accepted")
@@ -153,9 +138,6 @@ def build(args: argparse.Namespace) -> None:
     if args.goals:
         data["goals"] = len(goals)
         lines.append(f"{len(goals)} goal sets, seed {config.seed}")
-    if limited := restricted(licenced_parts(split, library)):
-        data["restricted"] = [part.as_dict() for part in limited]
-        lines += [f"restricted: {restriction_text(part)}" for part in limited]
     lines.append(f"verify it anywhere: morphgen split verify {report.folder}")
     opt.print_result(args, data, lambda: "\n".join(lines))
 
@@ -194,16 +176,12 @@ def stats(args: argparse.Namespace) -> None:
     for title, splits in groups.items():
         with bar(args, title):
             statistics_by_title[title] = statistics(splits[0], library, jobs=args.jobs)
-    limits = {
-        title: restricted(licenced_parts(splits[0], library)) for title, splits in groups.items()
-    }
     data = [
         {
             "robots": title,
             "splits": [split.name for split in splits],
             "ours": statistics_by_title[title],
             "paper": paper_row(title),
-            "restricted": [part.as_dict() for part in limits[title]],
         }
         for title, splits in groups.items()
     ]
@@ -219,8 +197,6 @@ def stats(args: argparse.Namespace) -> None:
             "links, joints, mass: mean over the train robots; cosine: of test and train robots",
             f"in parentheses: {survey.PAPER_TABLE}",
         ]
-        for title, parts in limits.items():
-            lines += [f"restricted licence in {title}: {restriction_text(part)}" for part in parts]
         return "\n".join(lines)
 
     opt.print_result(args, {"rows": data, "paper": survey.PAPER_TABLE}, text)
@@ -283,8 +259,6 @@ def new(args: argparse.Namespace) -> None:
     splits = [each.definition for each in loaded]
     paths = split_paths(args.out, splits)
     write_new_splits(splits, paths)
-    library = opt.library_of(args)
-    parts = [licenced_parts(split, library) for split in splits]
     data = [
         {
             "file": str(path),
@@ -292,14 +266,10 @@ def new(args: argparse.Namespace) -> None:
             "id": split_id(split),
             "train": len(split.train),
             "test": len(split.test),
-            "restricted": [part.as_dict() for part in restricted(licenced)],
         }
-        for split, path, licenced in zip(splits, paths, parts, strict=True)
+        for split, path in zip(splits, paths, strict=True)
     ]
     lines = [line for pair in zip(splits, paths, strict=True) for line in _summary(*pair)]
-    lines += _hold_out_notes(splits[-1], library)  # the largest has all train robots
-    if limits := restriction_line(parts[-1]):  # of the largest split
-        lines.append(f"  {limits}")
     folders = [word for folder in args.library for word in ("--library", str(folder))]
     lines.append(f"next: {shlex.join(['morphgen', 'split', 'audit', str(paths[-1]), *folders])}")
     opt.print_result(args, data, lambda: "\n".join(lines))
@@ -314,21 +284,6 @@ def _summary(split: Split, path: Path) -> list[str]:
     if repeated:
         lines.append(f"  {repeated} train robots have the body and task of an earlier one")
     return lines
-
-
-def _hold_out_notes(split: Split, library: Library) -> list[str]:
-    """Return what a user of ``--hold-out`` may not expect."""
-    if split.regime != HOLD_OUT:
-        return []
-    left_out = cast("Mapping[str, int]", split.provenance.get("left_out", {}))
-    return [
-        *(f"  left out: {n} drawn robots with {reason}" for reason, n in left_out.items()),
-        *(
-            f"  note: train robots have {', '.join(names)}; --hold-out {rule} excludes parts of "
-            "that manufacturer"
-            for rule, names in related_parts(split, library).items()
-        ),
-    ]
 
 
 def release(args: argparse.Namespace) -> None:

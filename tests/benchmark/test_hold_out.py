@@ -15,7 +15,6 @@ from morphgen.benchmark.hold_out import (
     hold_out_findings,
     parse_rules,
     parts_name,
-    related_parts,
     unique_names,
 )
 from morphgen.benchmark.regimes import parameters, pattern_robots
@@ -281,16 +280,6 @@ def test_a_malformed_hold_out_is_an_error_that_names_the_split(rules):
     provenance = {} if rules is None else {"hold_out": rules}
     with pytest.raises(BenchmarkError, match="split 'mine/some': made: hold_out"):
         codes(TRAIN, ["arm=lwr ee=plane"], provenance)
-
-
-def test_trained_parts_of_the_held_out_manufacturer_are_named():
-    def related(rule, train, test):
-        return related_parts(stated([train], [test], {"hold_out": [rule]}), LIBRARY)
-
-    arms = ("arm=mico ee=plane", "arm=kinova_gen3 ee=plane")
-    assert related("arm=kinova*", *arms) == {"arm.manufacturer=Kinova": ("mico",)}
-    assert related("arm=kinova*+ee=plane", *arms) == {}
-    assert related("arm=lwr", "arm=arm3 ee=plane", "arm=lwr ee=plane") == {}
 
 
 def robot(words):
