@@ -1,4 +1,4 @@
-"""Pictures of the similarity of robots: heatmaps and maps, with reproducible bytes."""
+"""Maps of the similarity of robots, with reproducible bytes."""
 
 from __future__ import annotations
 
@@ -13,20 +13,13 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.transforms import Bbox
 
 from morphgen.encoding.similarity import classical_mds, get_measure, to_distances
 from morphgen.typing import Array
 
-MAX_NAMED = 60  # largest number of robots whose names are drawn
-MAX_WITH_VALUES = 16  # largest number of robots whose values are written into the cells
-
 _DPI = 100
-_ROW_HEIGHT = 0.19  # height of a named row of a heatmap [inches]
 _LETTER_WIDTH = 0.075  # width of a letter of a name [inches]
-_MIN_SIDE, _UNNAMED_SIDE = 3.2, 8.0
-"""Smallest side of a heatmap, and side of one without names [inches]."""
 _LABEL_DISTANCES = (9, 16, 26, 40, 58, 80)
 """Distances of a name from its point, tried in turn [pixels]."""
 _MARKERS = "o^"  # markers of groups of robots: each with all colours, one after another
@@ -44,28 +37,6 @@ def _default_style() -> Iterator[None]:
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         yield
-
-
-@_default_style()
-def heatmap_png(names: Sequence[str], matrices: Mapping[str, Array]) -> bytes:
-    """Draw matrices by measure side by side, bright where robots are similar; return the PNG."""
-    n = len(names)
-    side = max(_MIN_SIDE, n * _ROW_HEIGHT) if n <= MAX_NAMED else _UNNAMED_SIDE
-    margin = _LETTER_WIDTH * max(map(len, names)) if n <= MAX_NAMED else 0.3
-    size = (margin + len(matrices) * (side + 0.9), margin + side + 0.5)
-    figure = Figure(figsize=size, dpi=_DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1))
-    axes = figure.subplots(1, len(matrices), squeeze=False)[0]
-    for (measure, values), ax in zip(matrices.items(), axes, strict=True):
-        is_similarity = get_measure(measure).larger_is_more_alike
-        apart = values[~np.eye(n, dtype=bool)] if n > 1 else values.ravel()
-        low, high = float(apart.min()), float(apart.max())
-        image = ax.imshow(values, "viridis" if is_similarity else "viridis_r", vmin=low, vmax=high)
-        figure.colorbar(image, ax=ax, fraction=0.045, pad=0.02).ax.tick_params(labelsize=8)
-        ax.set_title(get_measure(measure).title, fontsize=10)
-        _name_rows(ax, names, first=ax is axes[0])
-        if n <= MAX_WITH_VALUES:
-            _write_values(ax, values, low, high, is_similarity=is_similarity)
-    return _png(figure)
 
 
 @_default_style()
@@ -107,28 +78,6 @@ def _png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})  # has a version
     return buffer.getvalue()
-
-
-def _name_rows(ax: Axes, names: Sequence[str], *, first: bool) -> None:
-    if len(names) > MAX_NAMED:
-        ax.set_xlabel(f"{len(names)} robots in the order given", fontsize=9)
-        return
-    size = 8 if len(names) <= 30 else 7
-    ticks = range(len(names))
-    ax.set_xticks(ticks, names, rotation=90, fontsize=size, parse_math=False)
-    ax.set_yticks(ticks, names if first else [""] * len(names), fontsize=size, parse_math=False)
-    ax.tick_params(length=0)
-
-
-def _write_values(ax: Axes, values: Array, low: float, high: float, *, is_similarity: bool) -> None:
-    """Write the value into every cell, dark on bright and white on dark."""
-    for (row, column), value in np.ndenumerate(values):
-        bright = (value - low) / (high - low) if high > low else 0.0
-        if not is_similarity:
-            bright = 1 - bright
-        colour = "black" if bright > 0.6 else "white"
-        text = f"{value:.2f}".replace("0.", ".", 1) if abs(value) < 0.995 else f"{value:.0f}"
-        ax.text(column, row, text, ha="center", va="center", color=colour, fontsize=5.5)
 
 
 def _scatter(ax: Axes, points: Array, groups: Sequence[str]) -> None:

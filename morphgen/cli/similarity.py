@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import groupby
@@ -42,19 +40,10 @@ LARGEST_MATRIX = 20  # largest number of robots whose matrix is printed
 
 
 def similarity(args: argparse.Namespace) -> None:
-    """Compare the robots, print the result and write the files."""
+    """Compare the robots, print the result and draw the map."""
     measures = MEASURES[:-1] if args.measure == "all" else (args.measure,)
-    outputs = {
-        "--heatmap": (args.heatmap, ".png", _heatmap),
-        "--map": (args.map, ".png", _map),
-        "--csv": (args.csv, ".csv", _csv),
-    }
-    given = {option: row for option, row in outputs.items() if row[0] is not None}
-    files = [path.resolve() for path, _, _ in given.values()]
-    for option_name, (path, suffix, _) in given.items():  # before the long work
-        require_writable_file(path, option_name, suffix)
-        if files.count(path.resolve()) > 1:
-            raise BenchmarkError(f"{path}: is named for two files; name another for one of them")
+    if args.map is not None:  # before the long work
+        require_writable_file(args.map, "--map", ".png")
     robots, names, groups = _features(args)
     matrices: dict[str, Array] = {}
     pairs = len(measures) * len(names) * (len(names) + 1) // 2
@@ -62,10 +51,13 @@ def similarity(args: argparse.Namespace) -> None:
         for name in measures:
             with part_of(pairs, len(matrices) * pairs // len(measures)):
                 matrices[name] = similarity_matrix(robots, name)
-    with status(args, "drawing"):
-        contents = {path: write(names, matrices, groups) for path, _, write in given.values()}
-    for path, content in contents.items():
-        write_file(path, content)
+    files = [] if args.map is None else [str(args.map)]
+    if files:
+        from morphgen.benchmark.figures import map_png
+
+        with status(args, "drawing"):
+            picture = map_png(names, matrices, groups)
+        write_file(args.map, picture)
     results = {
         name: {
             "larger_is_more_alike": get_measure(name).larger_is_more_alike,
@@ -73,11 +65,11 @@ def similarity(args: argparse.Namespace) -> None:
         }
         for name, matrix in matrices.items()
     }
-    data = {"robots": names, "measures": results, "files": list(map(str, contents))}
+    data = {"robots": names, "measures": results, "files": files}
 
     def text() -> str:
         tables = "\n\n".join(_text(names, *item) for item in matrices.items())
-        return "\n".join([tables, *map(str, contents)])
+        return "\n".join([tables, *files])
 
     opt.print_result(args, data, text)
 
@@ -161,30 +153,6 @@ def _nearest_table(names: Sequence[str], measure: str, values: Array) -> str:
         for i, (name, nearest) in enumerate(zip(names, distance.argmin(axis=1), strict=True))
     ]
     return table(rows, ("robot", "nearest", measure, "mean of others"), formats=".3f")
-
-
-def _heatmap(names: Sequence[str], matrices: dict[str, Array], groups: Sequence[str]) -> bytes:
-    from morphgen.benchmark.figures import heatmap_png
-
-    return heatmap_png(names, matrices)
-
-
-def _map(names: Sequence[str], matrices: dict[str, Array], groups: Sequence[str]) -> bytes:
-    from morphgen.benchmark.figures import map_png
-
-    return map_png(names, matrices, groups)
-
-
-def _csv(names: Sequence[str], matrices: dict[str, Array], groups: Sequence[str]) -> bytes:
-    """Return a CSV table with a row per pair: two names and the value of each measure."""
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(("robot", "other", *matrices))
-    for i, robot in enumerate(names):
-        for j in range(i + 1, len(names)):
-            # repr has the digits from which the same number is read.
-            rows.writerow((robot, names[j], *(repr(float(m[i, j])) for m in matrices.values())))
-    return text.getvalue().encode()
 
 
 def tokens(args: argparse.Namespace) -> None:

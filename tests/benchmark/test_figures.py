@@ -9,12 +9,7 @@ from matplotlib.text import Text
 from PIL import Image
 
 from morphgen.benchmark import figures
-from morphgen.benchmark.figures import (
-    MAX_NAMED,
-    MAX_WITH_VALUES,
-    heatmap_png,
-    map_png,
-)
+from morphgen.benchmark.figures import map_png
 from morphgen.encoding.similarity import classical_mds
 
 
@@ -31,63 +26,33 @@ def groups(n):
     return [f"{i % 3 + 4} DoF" for i in range(n)]
 
 
-def drawings(n):
-    return heatmap_png(names(n), matrices(n)), map_png(names(n), matrices(n), groups(n))
+def drawing(n):
+    return map_png(names(n), matrices(n), groups(n))
 
 
 def pixels(png):
     return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), dtype=int)
 
 
-SLOW = pytest.param(MAX_NAMED, 1, marks=pytest.mark.slow)
-
-
-@pytest.mark.parametrize(
-    ("n", "times"), [(1, 1), (2, 2), (MAX_WITH_VALUES, 1), SLOW, (MAX_NAMED + 1, 2)]
-)
-def test_pictures_of_any_number_of_robots_are_reproducible_and_hold_no_version(n, times):
-    pictures, *again = (drawings(n) for _ in range(times))
-    assert again == [pictures] * (times - 1)
-    for png in pictures:
-        assert pixels(png).std() > 5
-        assert max(pixels(png).shape) < 2000
-        assert Image.open(io.BytesIO(png)).info.keys() <= {"dpi"}
-        assert matplotlib.__version__.encode() not in png
+@pytest.mark.parametrize("n", [1, 2, 16, 61])
+def test_pictures_of_any_number_of_robots_are_reproducible_and_hold_no_version(n):
+    png = drawing(n)
+    assert drawing(n) == png
+    assert pixels(png).std() > 5
+    assert max(pixels(png).shape) < 2000
+    assert Image.open(io.BytesIO(png)).info.keys() <= {"dpi"}
+    assert matplotlib.__version__.encode() not in png
 
 
 def test_matplotlib_settings_of_the_user_do_not_change_pictures():
-    before = drawings(5)
+    before = drawing(5)
     with matplotlib.rc_context({"font.size": 20, "axes.facecolor": "red", "savefig.dpi": 30}):
-        assert drawings(5) == before
+        assert drawing(5) == before
         assert matplotlib.rcParams["font.size"] == 20
-
-
-def test_bright_cells_mean_similar_robots_for_every_measure():
-    n = MAX_NAMED + 20
-    half = np.arange(n) < n / 2
-    apart = (half[:, None] != half).astype(float)
-    for measure, values in (("tree", apart), ("cosine", 1 - apart)):
-        picture = pixels(heatmap_png(names(n), {measure: values}))
-        height, width, _ = picture.shape
-        alike, different = picture[height // 4, width // 4], picture[height // 4, 3 * width // 4]
-        assert alike.sum() > 450
-        assert different.sum() < 250
-
-
-def test_robots_of_a_matrix_are_labelled_up_to_a_limit():
-    few = pixels(heatmap_png(["a" * 20] * 20, matrices(20)))
-    short = pixels(heatmap_png(["a"] * 20, matrices(20)))
-    assert few.shape[0] > short.shape[0] + 50
-    assert few.shape[1] > short.shape[1] + 50
-    many = MAX_NAMED + 1
-    assert heatmap_png(["a" * 20] * many, matrices(many)) == heatmap_png(
-        ["b"] * many, matrices(many)
-    )
 
 
 def test_names_are_not_parsed_as_formulas():
     odd = ["$\\frac$", "a_b", "$", "\\alpha"]  # the first would be refused as one
-    assert heatmap_png(odd, matrices(4))
     assert map_png(odd, matrices(4), odd)
 
 

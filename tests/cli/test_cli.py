@@ -170,8 +170,8 @@ def test_a_missing_folder_does_not_stop_other_exports(run):
 
 def test_places_that_cannot_be_written_are_refused_before_the_work(refused, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write anywhere
-    error = refused("similarity", "plane", "--csv", "a.csv")
-    assert "--csv a.csv: folder . cannot be written" in error
+    error = refused("similarity", "plane", "--map", "a.png")
+    assert "--map a.png: folder . cannot be written" in error
     assert "cannot write to out: " in refused("fit", "plane", "--out", "out/made")
 
 

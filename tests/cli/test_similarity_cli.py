@@ -1,6 +1,5 @@
 """``morphgen similarity``: output, written files and rejected input."""
 
-import csv
 import json
 import sys
 from dataclasses import replace
@@ -45,14 +44,10 @@ def light_set(run):
 def test_folder_of_bundles_gives_one_matrix_per_measure(ok, bundles, tmp_path):
     before = tree(tmp_path)
     assert list(json.loads(ok("similarity", "robots", "--json"))["measures"]) == ["tree"]
-    pictures = ("--heatmap", "heat.png", "--map", "map.png")
-    out, last = ok("similarity", *ARGUMENTS, *pictures).rsplit("heat.png\n", 1)
-    assert last == "map.png\n"
+    out = ok("similarity", *ARGUMENTS, "--map", "map.png")
     written = {name: data for name, data in tree(tmp_path).items() if name not in before}
-    assert {name: data[:4] for name, data in written.items()} == dict.fromkeys(
-        ("heat.png", "map.png"), b"\x89PNG"
-    )
-    blocks = out.rstrip("\n").split("\n\n")
+    assert {name: data[:4] for name, data in written.items()} == {"map.png": b"\x89PNG"}
+    blocks = out.removesuffix("\nmap.png\n").split("\n\n")
     robot_features = [features(robot, token_shapes(robot)) for robot in bundles]
     for block, measure in zip(blocks, MEASURES.values(), strict=True):
         title, header, _, *rows, statistics = block.splitlines()
@@ -67,10 +62,10 @@ def test_folder_of_bundles_gives_one_matrix_per_measure(ok, bundles, tmp_path):
         assert statistics.startswith("3 pairs: mean ")
 
 
-def test_json_holds_the_matrices_and_csv_has_one_line_per_pair(ok, bundles):
-    data = json.loads(ok("similarity", *ARGUMENTS, "--csv", "pairs.csv", "--json"))
+def test_json_holds_the_matrices(ok, bundles):
+    data = json.loads(ok("similarity", *ARGUMENTS, "--json"))
     assert data["robots"] == ["arm", "lwr-claw", "lwr-plane"]
-    assert data["files"] == ["pairs.csv"]
+    assert data["files"] == []
     assert list(data["measures"]) == list(MEASURES)
     robot_features = [features(robot, token_shapes(robot)) for robot in bundles]
     for name, about in data["measures"].items():
@@ -78,13 +73,6 @@ def test_json_holds_the_matrices_and_csv_has_one_line_per_pair(ok, bundles):
         np.testing.assert_allclose(
             about["matrix"], similarity_matrix(robot_features, name), atol=1e-6
         )
-    with Path("pairs.csv").open(newline="") as lines:
-        rows = list(csv.DictReader(lines))
-    pairs = [("arm", "lwr-claw"), ("arm", "lwr-plane"), ("lwr-claw", "lwr-plane")]
-    assert [(row["robot"], row["other"]) for row in rows] == pairs
-    for name, about in data["measures"].items():
-        values = np.array(about["matrix"])[np.triu_indices(3, 1)]
-        assert [float(row[name]) for row in rows] == values.tolist()
 
 
 def test_paths_can_be_mixed_and_duplicates_are_dropped(ok, bundles, light_set):

@@ -26,7 +26,7 @@ WRITERS = {
     "sample": ["sample", "chain", "-n", 2, "--light", "--out", "out"],
     "build": ["split", "build", "interpolation/arm3/reach", "--light", "--out", "out"],
     "tokens": ["tokens", "prims", "--out", "out.npz"],
-    "similarity": ["similarity", "prims", "z1-plane", "--measure", "tree", "--csv", "out.csv"],
+    "similarity": ["similarity", "prims", "z1-plane", "--measure", "tree", "--map", "out.png"],
 }
 """Commands that write files and folders."""
 RESUMED = {".journal.jsonl"}
