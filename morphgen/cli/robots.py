@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
 from morphgen.checks import check
 from morphgen.cli import options as opt
-from morphgen.cli.progress import bar, status, track
-from morphgen.errors import CompositionError, FormatError, MorphgenError
+from morphgen.cli.progress import bar, status
+from morphgen.errors import CompositionError, FormatError
 from morphgen.formats.bundle import CARD, URDF, bundle_folder, write_bundle
 from morphgen.formats.data_files import read_json
 from morphgen.formats.description import NamedDescription, find_description
@@ -148,18 +145,9 @@ def _facts(robot: Robot) -> dict[str, object]:
     }
 
 
-def import_robots(args: argparse.Namespace) -> int:
-    """Import descriptions, check them and write their bundles."""
-    sources = list(dict.fromkeys(args.files))
-    if len(sources) > 1:
-        if args.name is not None:
-            raise FormatError(f"--name {args.name}: {len(sources)} robots cannot have one name")
-        if args.srdf is not None:
-            raise FormatError(
-                f"--srdf {args.srdf}: is of one robot, and {len(sources)} are named; import its "
-                "robot alone"
-            )
-    elif args.name is not None:
+def import_robot(args: argparse.Namespace) -> int:
+    """Import a description, check it and write its bundle."""
+    if args.name is not None:
         bundle_folder(args.out, args.name)  # refuses an invalid name before the work
     if args.root is not None and not args.root.is_dir():
         raise FormatError(
@@ -167,9 +155,7 @@ def import_robots(args: argparse.Namespace) -> int:
             "--root-link"
         )
     xacro_args = _xacro_args(args.arg)
-    if len(sources) > 1:
-        return _import_several(sources, args, xacro_args)
-    data, text, code = _import(find_description(sources[0]), args.name, xacro_args, args)
+    data, text, code = _import(find_description(args.file), xacro_args, args)
     opt.print_result(args, data, lambda: text)
     return code
 
@@ -183,81 +169,24 @@ def _xacro_args(words: Sequence[str]) -> dict[str, str]:
     return {key: value for key, _, value in pairs}
 
 
-def _import_several(
-    sources: Sequence[str], args: argparse.Namespace, xacro_args: Mapping[str, str]
-) -> int:
-    """Import every file that can be, and print what became of each; return the exit code."""
-    found: dict[str, NamedDescription | MorphgenError] = {}
-    for file in sources:
-        try:
-            found[file] = find_description(file)
-        except MorphgenError as error:
-            found[file] = error
-    names = _bundle_names(found)
-    code = 0
-    objects: list[dict[str, object]] = []
-    for file, description in track(list(found.items()), args, "importing", "robot", len(found)):
-        try:
-            if isinstance(description, MorphgenError):
-                raise description
-            data, text, own_code = _import(description, names[file], xacro_args, args)
-        except MorphgenError as error:
-            objects.append({"file": file, **opt.refusal(error, file, Path(file).name)})
-            code = 2
-            continue
-        objects.append({"file": file, **data})
-        code = max(code, own_code)
-        if not args.json:
-            print(text)
-    if args.json:
-        print(json.dumps(objects, default=str))
-    return code
-
-
-def _bundle_names(found: Mapping[str, NamedDescription | MorphgenError]) -> dict[str, str]:
-    """Return the names of the bundles: those of the descriptions, without their suffixes."""
-    names = {
-        file: re.sub(r"\W", "_", description.path.stem.removesuffix(".urdf"), flags=re.ASCII)
-        for file, description in found.items()
-        if not isinstance(description, MorphgenError)
-    }
-    names = {file: name.lstrip("_") or name for file, name in names.items()}
-    for file, name in names.items():
-        try:
-            bundle_folder(Path(), name)
-        except FormatError as error:
-            raise FormatError(f"{file}: {error}; import it alone, with --name") from error
-    for name, count in Counter(names.values()).items():
-        if count > 1:
-            files = [file for file, own in names.items() if own == name]
-            raise FormatError(
-                f"{', '.join(files)}: these would all be named {name!r}; import one at a time, "
-                "with --name"
-            )
-    return names
-
-
 def _import(
-    description: NamedDescription,
-    name: str | None,
-    xacro_args: Mapping[str, str],
-    args: argparse.Namespace,
+    description: NamedDescription, xacro_args: Mapping[str, str], args: argparse.Namespace
 ) -> Written:
     """Import a robot, and write its bundle and, if asked for, its manifest."""
-    from morphgen.grammar.robot_source import import_robot
+    from morphgen.grammar import robot_source
 
     licence = args.licence or description.licence
     if args.part and not licence:
         raise FormatError("--part: name the robot's licence by --licence, such as MIT")
     with status(args, f"importing {description.path}"):
-        robot = import_robot(
+        robot = robot_source.import_robot(
             description.path,
             {**description.args, **xacro_args},
             root=args.root,
             root_link=args.root_link,
             tool=args.tool,
             srdf=args.srdf,
-            name=name,
+            name=args.name,
             repair=not args.as_is,
             skip_missing_meshes=args.skip_missing_meshes,
         )

@@ -1,4 +1,4 @@
-"""Imported robots become parts; several files and robots of collections are imported."""
+"""Imported robots become parts; robots of collections are imported."""
 
 import json
 import sys
@@ -20,7 +20,6 @@ ARM = f"""<worldbody>
     </body>
   </body>
 </worldbody>"""
-BALL = '<worldbody><body><joint type="ball"/><geom size="0.1"/></body></worldbody>'
 
 
 def test_the_urdf_of_a_bundle_is_imported_with_its_frames(run, tmp_path):
@@ -67,45 +66,17 @@ def test_an_imported_arm_carries_an_end_effector(run, tmp_path):
     assert tree(tmp_path) == before
 
 
-def test_a_set_of_bodies_becomes_parts_and_the_refused_are_named(run, ok, tmp_path):
+def test_bodies_become_parts_of_a_split(ok, tmp_path):
     write(tmp_path, ARM, "body_1.xml")
     write(tmp_path, ARM.replace("0 0 0.2", "0 0 0.18"), "body_2.xml")
-    write(tmp_path, BALL, "body_3.xml")
-    files = [f"body_{k}.xml" for k in (1, 2, 3)]
-    code, _, err = run("import", *files, "--part", "body", "--licence", "MIT", "--no-picture")
-    assert code == 2
-    assert err.count("\n") == 1
-    assert "body_3.xml: joint" in err
+    for body in ("body_1", "body_2"):
+        words = ("--name", body, "--part", "body", "--licence", "MIT", "--no-picture")
+        ok("import", f"{body}.xml", *words)
     assert {path.name for path in (tmp_path / "parts").iterdir()} == {"body_1.yaml", "body_2.yaml"}
     (tmp_path / "set.grammar").write_text("robot -> body_1 | body_2\n")
     words = ("--library", "parts", "--train", "1", "--test", "1", "--name", "my/set")
     ok("split", "new", "--grammar", "set.grammar", "--hold-out", "body=body_2", *words)
     assert "body_2" in (tmp_path / "my" / "set.yaml").read_text()
-
-
-def test_several_files_give_one_json_array_in_which_the_refused_have_a_reason(run, tmp_path):
-    write(tmp_path, ARM, "a.xml")
-    write(tmp_path, BALL, "b.xml")
-    write(tmp_path, ARM, "1st.xml")
-    files = ("a.xml", "menagerie:no_such_robot", "b.xml", "c.xml", "1st.xml")
-    words = ("--part", "arm", "--licence", "MIT", "--no-picture", "--json")
-    code, out, err = run("import", *files, *words)
-    objects = json.loads(out)
-    assert code == 2
-    assert tuple(each["file"] for each in objects) == files
-    assert [path.name for path in (tmp_path / "parts").iterdir()] == ["a.yaml"]
-    assert (objects[0]["folder"], objects[0]["part"]) == ("robots/a", "parts/a.yaml")
-    assert objects[0]["card"]["name"] == "a"
-    reasons = [each["message"] for each in objects[1:]]
-    assert {each["error"] for each in objects[1:]} == {"FormatError"}
-    assert err.splitlines() == [f"morphgen: {reason}" for reason in reasons]
-    parts = ("menagerie:no_such_robot: ", "type ball", "c.xml", "import its file alone")
-    for file, reason, part in zip(files[1:], reasons, parts, strict=True):
-        assert file in reason
-        assert part in reason
-    code, out, _ = run("import", "a.xml", "a.xml", *words)  # a file named twice is one file
-    one = json.loads(out)
-    assert (code, one["folder"], one["part"]) == (0, "robots/test", "parts/test.yaml")
 
 
 def test_a_robot_of_the_menagerie_is_imported_with_its_licence(run, refused, tmp_path, monkeypatch):
