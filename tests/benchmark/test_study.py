@@ -1,4 +1,4 @@
-"""Studies: cells, resumption, tables and curves."""
+"""Studies: cells, resumption and tables."""
 
 import json
 import re
@@ -8,10 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import msgspec
-import numpy as np
 import pytest
 from filelock import FileLock
-from PIL import Image
 
 import morphgen
 from helpers.commands import tree
@@ -19,7 +17,6 @@ from helpers.runs import EVAL, QUIET, equal, small_config, small_source, weights
 from morphgen.benchmark.scores import study
 from morphgen.benchmark.scores.results import result_rows
 from morphgen.benchmark.scores.study import (
-    CURVES,
     DATA,
     TABLE,
     agent_cell,
@@ -37,7 +34,7 @@ from morphgen.formats.files import LOCK
 from morphgen.rl.inference import MODES
 from morphgen.rl.runs.checkpoint import CHECKPOINT
 from morphgen.rl.runs.robot_source import members, other_side, split_of, split_source
-from morphgen.rl.runs.training import METRICS, subruns_of
+from morphgen.rl.runs.training import subruns_of
 from morphgen.rl.scores import UNSTABLE, iqm_interval, relative_scores
 
 pytestmark = pytest.mark.slow
@@ -225,7 +222,7 @@ def test_missing_and_diverged_episodes_are_named_under_the_table(whole, tmp_path
         robots = (robot, *each.robots[1:])
         append_submission(table, msgspec.structs.replace(each, robots=robots))
     cells = [replace(cell, study=tmp_path / "study") for cell in whole]
-    assert [path.name for path in write_tables(tmp_path, cells)] == [TABLE, DATA, CURVES]
+    assert [path.name for path in write_tables(tmp_path, cells)] == [TABLE, DATA]
     text = (tmp_path / TABLE).read_text()
     name = "mine/small"
     missing = [f"{name} se seed 1", f"{name} me-mlp seed 0", f"{name} me-mlp seed 1"]
@@ -235,34 +232,6 @@ def test_missing_and_diverged_episodes_are_named_under_the_table(whole, tmp_path
     few = [replace(cells[4], finetune=(10,))]
     write_tables(tmp_path, few)
     assert f"- missing: {name} se seed 0 (fine-tuned 10)" in (tmp_path / TABLE).read_text()
-
-
-def test_curves_are_those_of_trained_agents_as_long_as_the_longest_seed(
-    whole, tmp_path, monkeypatch
-):
-    drawn = []
-    from matplotlib.axes import Axes
-
-    plot = Axes.plot
-    monkeypatch.setattr(
-        Axes, "plot", lambda self, *a, **k: drawn.append((k["label"], a)) or plot(self, *a, **k)
-    )
-    path = whole[-1].folder / METRICS
-    text = path.read_text()
-    for shorter in (text.splitlines(keepends=True)[0], ""):
-        path.write_text(shorter)
-        try:
-            write_tables(tmp_path, whole)
-        finally:
-            path.write_text(text)
-        (se, (steps, values)), (mlp, own) = drawn
-        assert (se, mlp) == ("se", "me-mlp (1 of 2 seeds to the end)")
-        for x, y in ((steps, values), own):
-            assert list(x) == [32, 64]
-            assert np.isfinite(y).all()
-        drawn.clear()
-    with Image.open(tmp_path / CURVES) as image:
-        assert image.size[0] > 500
 
 
 def test_an_agent_trained_on_the_test_robots_has_only_test_scores(tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import sys
 import time
@@ -15,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 from filelock import FileLock, Timeout
 
 from morphgen.benchmark.scores import submission
@@ -48,8 +46,6 @@ from morphgen.rl.runs.training import (
     ShowMetrics,
     Subrun,
     finetuning_config,
-    read_metrics,
-    subruns_of,
     train,
 )
 from morphgen.rl.scores import UNSTABLE, Score
@@ -339,12 +335,12 @@ def _do_locked(
     return ""
 
 
-TABLE, DATA, CURVES = "table.md", "results.json", "curves.png"
+TABLE, DATA = "table.md", "results.json"
 MISSING = "missing"
 
 
 def write_tables(folder: Path, cells: Sequence[Cell]) -> list[Path]:
-    """Write Markdown, JSON and curves of the cells of a study that are done; return their paths."""
+    """Write Markdown and JSON of the cells of a study that are done; return their paths."""
     done: dict[str, submission.Submission] = {}
     missing: list[str] = []
     for cell in cells:
@@ -365,54 +361,4 @@ def write_tables(folder: Path, cells: Sequence[Cell]) -> list[Path]:
     write_file(folder / TABLE, "\n".join(lines) + "\n")
     data = {"rows": rows_data(rows), MISSING: missing}
     write_file(folder / DATA, json.dumps(data, indent=2) + "\n")
-    write_file(folder / CURVES, curves(cells))
-    return [folder / name for name in (TABLE, DATA, CURVES)]
-
-
-def curves(cells: Sequence[Cell]) -> bytes:
-    """Return a PNG of training scores, a panel per split: mean over seeds, and their range."""
-    from matplotlib.figure import Figure
-
-    splits = list(dict.fromkeys(cell.split for cell in cells))
-    figure = Figure(figsize=(7.0, 4.8 * len(splits)), layout="constrained")
-    panels = figure.subplots(len(splits), 1, squeeze=False)[:, 0]
-    for panel, split in zip(panels, splits, strict=True):
-        panel.set(title=split, xlabel="transitions", ylabel="score of a step, in training")
-        panel.grid(alpha=0.3)
-        for agent in dict.fromkeys(c.agent for c in cells if c.split == split and c.config):
-            own = [c for c in cells if (c.split, c.agent) == (split, agent)]
-            runs = [curve for curve in map(_curve, own) if curve is not None]
-            if not runs:
-                panel.plot([], [], label=f"{agent}: {MISSING}", color="0.6", linestyle=":")
-                continue
-            steps = max((steps for steps, _, _ in runs), key=len)
-            values = np.full((len(runs), len(steps)), np.nan)  # nan where a seed is not there yet
-            for row, (_, scores, _) in zip(values, runs, strict=True):
-                row[: len(scores)] = scores
-            done = sum(complete for _, _, complete in runs)
-            note = "" if done == len(own) else f" ({done} of {len(own)} seeds to the end)"
-            (line,) = panel.plot(steps, np.nanmean(values, axis=0), label=agent + note)
-            low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
-            panel.fill_between(steps, low, high, alpha=0.2, color=line.get_color())
-        if panel.lines:
-            panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize="small")
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=150)
-    return content.getvalue()
-
-
-def _curve(cell: Cell) -> tuple[list[int], list[float], bool] | None:
-    """Return the mean training curve of a run's parts; None if there are no metrics yet.
-
-    It has, per update, the transitions so far and the mean score of a control step; and whether all
-    updates have been made.
-    """
-    assert cell.config is not None
-    runs = subruns_of(cell.folder, cell.config)
-    parts = [read_metrics(part.folder) for part in runs]
-    length = min(map(len, parts))
-    if not length:
-        return None
-    steps = [sum(part[i]["transitions"] for part in parts) for i in range(length)]
-    scores = [float(np.mean([part[i]["score"] for part in parts])) for i in range(length)]
-    return steps, scores, all(length == run.config.num_updates for run in runs)
+    return [folder / name for name in (TABLE, DATA)]
