@@ -57,7 +57,7 @@ class LinkFit:
     single: Shape | None  # the single primitive of largest overlap; None if it was not searched for
     solid: str  # how the solid was made, see `solid.Method`; `primitives` if the shapes were kept
     quality: Quality
-    seconds: float  # duration of the fit [s]; 0 for a link that shares the fit of a congruent one
+    seconds: float  # duration of the fit [s]; 0 for a link that shares the fit of another
     decimated_from: int | None = None
     """Number of triangles before decimation; None if the mesh was not decimated."""
 
