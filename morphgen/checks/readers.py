@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,12 +15,9 @@ import numpy as np
 from morphgen.errors import FormatError, one_line
 from morphgen.formats.bundle import MJCF, URDF
 from morphgen.formats.quiet import quiet
-from morphgen.formats.usd import convert_urdf, prim_name
 from morphgen.model.dynamics import GRAVITY
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import joint_motions
-from morphgen.model.robot import Joint, JointKind, Mimic
-from morphgen.model.rotation import unit_quaternion, vec3
+from morphgen.model.robot import Mimic
 from morphgen.typing import Array
 
 if TYPE_CHECKING:
@@ -400,89 +396,11 @@ def _mujoco_mimics(model: mujoco.MjModel) -> Iterator[tuple[str, Mimic]]:
         yield model.joint(follower).name, Mimic(name, multiplier, offset)
 
 
-def read_usd(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> Reading:
-    """Convert the URDF to USD and follow its physics joints from the root link to the frame.
-
-    They have poses on both bodies; the prims only have the pose in which all joints are at zero. Of
-    the joints only the position limits are read: ``UsdPhysics`` has no others.
-    """
-    from pxr import Usd, UsdPhysics
-
-    with TemporaryDirectory() as scratch:
-        stage = Usd.Stage.Open(str(convert_urdf(folder / URDF, Path(scratch))))
-        prims = list(stage.Traverse())
-        joints = {
-            str(body): joint
-            for joint in map(UsdPhysics.Joint, prims)
-            if joint
-            for body in joint.GetBody1Rel().GetTargets()
-        }
-        links = stage.GetDefaultPrim().GetChild("Geometry")
-        of_frame = [prim for prim in Usd.PrimRange(links) if prim_name(prim) == frame or not frame]
-        if not of_frame:
-            raise FormatError(f"no prim {frame!r}")
-        T_world_root, T_world_frame = (
-            _poses(prim, joints, q, n) for prim in (links.GetChildren()[0], of_frame[0])
-        )
-        masses = [UsdPhysics.MassAPI(prim).GetMassAttr().Get() for prim in prims]
-        movable = {
-            prim_name(joint.GetPrim()): JointReading(limits=_limits(joint.GetPrim()))
-            for joint in joints.values()
-            if not joint.GetPrim().IsA(UsdPhysics.FixedJoint)
-        }
-    mass = float(sum(value for value in masses if value is not None))
-    return Reading(movable, mass, np.linalg.inv(T_world_root) @ T_world_frame, mimics=None)
-
-
-def _limits(prim: Any) -> tuple[float, float]:  # noqa: ANN401
-    scale = 1.0 if prim.GetTypeName() == "PhysicsPrismaticJoint" else math.pi / 180
-    lower, upper = (prim.GetAttribute(f"physics:{end}Limit").Get() for end in ("lower", "upper"))
-    return (
-        -math.inf if lower is None else scale * lower,
-        math.inf if upper is None else scale * upper,
-    )
-
-
-def _poses(prim: Any, joints: Mapping[str, Any], q: Mapping[str, Array], n: int) -> Array:  # noqa: ANN401
-    if not prim or prim.IsPseudoRoot():
-        return np.tile(np.eye(4), (n, 1, 1))
-    joint = joints.get(str(prim.GetPath()))
-    if joint is None:
-        import usdex.core
-
-        # OpenUSD's own matrix of a small rotation is the identity; see morphgen/formats/usd.py.
-        position, _, rotation, _ = usdex.core.getLocalTransformComponentsQuat(prim)
-        return _poses(prim.GetParent(), joints, q, n) @ _local(position, rotation)
-    parents = joint.GetBody0Rel().GetTargets()
-    parent = prim.GetStage().GetPrimAtPath(parents[0]) if parents else None
-    return (
-        _poses(parent, joints, q, n)
-        @ _local(joint.GetLocalPos0Attr().Get(), joint.GetLocalRot0Attr().Get())
-        @ _motion(joint.GetPrim(), q, n)
-        @ np.linalg.inv(_local(joint.GetLocalPos1Attr().Get(), joint.GetLocalRot1Attr().Get()))
-    )
-
-
-def _motion(prim: Any, q: Mapping[str, Array], n: int) -> Array:  # noqa: ANN401
-    axis, positions = prim.GetAttribute("physics:axis").Get(), q.get(prim_name(prim))
-    if axis is None or positions is None:  # a fixed joint has no axis
-        return np.tile(np.eye(4), (n, 1, 1))
-    kind: JointKind = "prismatic" if prim.GetTypeName() == "PhysicsPrismaticJoint" else "revolute"
-    joint = Joint("", kind, "", "", axis=vec3(np.eye(3)["XYZ".index(axis)].tolist()))
-    return joint_motions([joint], positions[:, None])[:, 0]
-
-
-def _local(position: Any, rotation: Any) -> Array:  # noqa: ANN401
-    quaternion = unit_quaternion((rotation.GetReal(), *rotation.GetImaginary()))
-    return Pose(vec3(position), quaternion).matrix
-
-
 LOADERS = (
     Loader("yourdfpy", "yourdfpy", read_yourdfpy, URDF),
     Loader("pybullet", "pybullet", read_pybullet, URDF),
     Loader("mujoco (urdf)", "mujoco", partial(read_mujoco, URDF), URDF),
     Loader("mujoco (mjcf)", "mujoco", partial(read_mujoco, MJCF), MJCF),
     Loader("pinocchio", "pinocchio", read_pinocchio, URDF),
-    Loader("usd", "urdf_usd_converter", read_usd, URDF),
 )
 """Loaders of a bundle. Those of the URDF also read a URDF of others, that of the MJCF an MJCF."""

@@ -45,7 +45,7 @@ def convert_urdf(urdf: Path, folder: Path) -> Path:
     return Path(asset.path)
 
 
-def prim_name(prim: Usd.Prim) -> str:
+def _prim_name(prim: Usd.Prim) -> str:
     """Return the URDF's name of a prim: USD allows fewer characters, so it may be a label."""
     return str(prim.GetMetadata("displayName") or prim.GetName())
 
@@ -70,7 +70,7 @@ def _write_poses(stage: Usd.Stage, urdf: Path) -> None:
     def origin_of(prim: Usd.Prim) -> Pose | None:
         parent = prim.GetParent()
         is_link = parent and prim.GetTypeName() == "Xform"
-        return origins.get((prim_name(parent), prim_name(prim))) if is_link else None
+        return origins.get((_prim_name(parent), _prim_name(prim))) if is_link else None
 
     for prim in stage.Traverse():
         orient, T_parent_link = prim.GetAttribute("xformOp:orient"), origin_of(prim)

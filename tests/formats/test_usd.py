@@ -1,15 +1,19 @@
 """Export to USD: what a stage holds, read with OpenUSD itself."""
 
+import math
 import re
 from pathlib import Path
 
 import pytest
 
 import morphgen
+from helpers.faulty_robots import with_joint
+from helpers.robots import arm
 from morphgen.cli import main
 from morphgen.errors import FormatError
+from morphgen.formats.bundle import write_bundle
 from morphgen.formats.usd import convert_urdf
-from morphgen.model.geometry import Mesh
+from morphgen.model.geometry import Mesh, Pose
 
 pytest.importorskip("urdf_usd_converter")
 from pxr import Usd, UsdGeom, UsdPhysics
@@ -54,6 +58,18 @@ def test_joints_have_their_couplings(stage):
         assert leader.name == joint.mimic.joint
         multiplier = prims[joint.name].GetAttribute("newton:mimicCoef1").Get()
         assert multiplier == joint.mimic.multiplier
+
+
+@pytest.mark.parametrize("turn", [2.1e-5, 5e-4])
+def test_small_turns_of_joints_are_exact(turn, tmp_path):
+    """The converter alone takes angles from a cosine in single precision."""
+    mounted = Pose.from_xyz_rpy((0.0, 0.0, 0.3), (turn, 0.0, 0.0))
+    robot = with_joint(arm(), "elbow", T_parent_joint=mounted)
+    bundle = write_bundle(robot, tmp_path / "bundle", picture=False)
+    stage = Usd.Stage.Open(str(convert_urdf(bundle / "robot.urdf", tmp_path / "usd")))
+    joint = UsdPhysics.Joint(next(p for p in stage.Traverse() if p.GetName() == "elbow"))
+    R = joint.GetLocalRot0Attr().Get() * joint.GetLocalRot1Attr().Get().GetInverse()
+    assert 2 * math.asin(R.GetImaginary().GetLength()) == pytest.approx(turn, abs=1e-7)
 
 
 def test_the_folder_stands_alone(folder, stage):
