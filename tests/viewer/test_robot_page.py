@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from helpers.pages import choose, field, nodes, pointer, press, wait_until
-from helpers.robots import arm, finger
+from helpers.robots import arm
 from helpers.viser_client import PlainClient
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.formats.bundle import write_bundle
@@ -30,7 +30,6 @@ from morphgen.viewer.robot_rows import Row, part_rows, passes, sort_rows
 from morphgen.viewer.robot_tables import is_about, joint_groups, link_card, link_table
 from morphgen.viewer.robot_uri import read_robot_uri
 from morphgen.viewer.scene import overlays as workspace
-from morphgen.viewer.scene.overlays import range_lines
 from morphgen.viewer.scene.robot import RED
 from morphgen.viewer.scene.stage import add_scale_bar, inertia_box, look_at
 
@@ -302,22 +301,6 @@ def test_a_point_on_the_axis_does_not_turn_the_joint():
     assert turn_towards(robot, Q, 0, link, np.zeros(3), np.ones(3)) == pytest.approx(Q)
 
 
-def test_the_range_of_a_hinge_is_an_arc_between_its_limits():
-    joint = arm().joints[0]
-    needle, track, axis = range_lines(joint, 0.2, (0.0, 0.0, 1.0))
-    assert np.linalg.norm(track[:-2], axis=-1) == pytest.approx(0.2, abs=1e-9)
-    angles = [np.arctan2(p[0], p[2]) for p in (track[0, 0], track[-3, 1])]
-    assert angles == pytest.approx(joint.limits)
-    assert np.cross(axis[0, 1] - axis[0, 0], joint.axis) == pytest.approx(0)
-    assert needle @ joint.axis == pytest.approx(0)
-
-
-def test_the_range_of_a_slide_is_a_line_between_its_limits():
-    joint = finger().joints[0]
-    _, track, _ = range_lines(joint, 0.2, (1.0, 0.0, 0.0))
-    assert track[0] == pytest.approx(np.array([[0, -3, 0], [0, 3, 0]]))
-
-
 def test_a_card_shows_mass_limits_in_both_units_and_the_findings_of_its_link():
     robot = arm()
     findings = [
@@ -362,26 +345,10 @@ def test_a_click_selects_a_link_and_a_drag_turns_its_joint(viewer):
         client.send(drag)
         goal = poses([1.0, *robot.home[1:]])[1] @ [0, 0, 0.3, 1]
         client.send({**drag, "phase": "update", "end_position": goal[:3].tolist()})
-        client.until(lambda: "/robot/0/range" in view)
         client.shows("q=1,0.5,0.01,0.02")
         client.send({**drag, "phase": "end", "end_position": goal[:3].tolist()})
-        client.until(lambda: "/robot/0/range" not in view)
         client.send(click)
         client.until(lambda: "/robot/1/outline0" not in view)
-
-
-@pytest.mark.slow
-def test_hovering_over_a_joint_shows_its_range(see, viewer):
-    on = viewer()
-    page = see(f"{ARM}&link=lower&angles=deg", on=on)
-    page.get_by_text("no self-collision").wait_for()
-    assert "/robot/2/outline0" in nodes(on)
-    assert field(page, "shoulder").last.input_value() == "23"
-    page.get_by_text("shoulder", exact=True).hover()
-    wait_until(lambda: "/robot/0/range" in nodes(on))
-    page.mouse.move(300, 100)
-    wait_until(lambda: "/robot/0/range" not in nodes(on))
-    assert page.failures == []
 
 
 @pytest.fixture(scope="module")

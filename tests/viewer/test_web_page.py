@@ -255,15 +255,6 @@ def test_a_narrow_window_has_its_cards_above_the_panel(shared_viewer):
         assert html.count('class=\\"card\\"') == 24
 
 
-def test_a_script_shows_the_range_of_a_joint_and_of_no_other_number(shared_viewer, quiet):
-    with PlainClient(shared_viewer.port, "?robot=robots/some-arm") as client:
-        script = Script(client, shared_viewer.port)
-        client.shows("no self-collision")
-        for row in ("9" * 5000, "²", "0"):
-            assert script.send("hover", row) == 200
-        client.until(lambda: any(m.get("name", "").endswith("/range") for m in client.messages))
-
-
 def test_only_the_script_of_a_page_can_change_it(viewer):
     on = viewer()
     with PlainClient(on.port, "?population=") as client:

@@ -27,8 +27,7 @@ from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
 from morphgen.viewer import markup, robot_tables, robot_uri
-from morphgen.viewer.app.address import Address, parse_count
-from morphgen.viewer.app.frame import call
+from morphgen.viewer.app.address import Address
 from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.app.viser_internals import control_id
 from morphgen.viewer.app.web_page import robot_page
@@ -120,7 +119,6 @@ class RobotPage:
         self._checker: SelfCollisionChecker | None = None
         self._sliders: list[viser.GuiSliderHandle[float]] = []  # in the order of q
         self._folders: list[viser.GuiFolderHandle] = []  # folders of the sliders
-        self._range_row: int | None = None  # joint whose axis and range are drawn, by row of q
         gui.add_html(summary(robot, _links(robot, uri)))
         self._card, self._mark = gui.add_html(""), gui.add_html("")
         tabs = gui.add_tab_group()
@@ -144,7 +142,6 @@ class RobotPage:
         session.on_change(buttons, lambda: self._go_to(buttons.value))
         session.on_change(self._angles, self._add_sliders)
         session.on_change(self._link, lambda: self.select(self.selected))
-        session.actions["hover"] = self._hover
         self._connect_links()
         session.title = robot.name
         bind(session, "angles", self._angles)
@@ -220,8 +217,6 @@ class RobotPage:
                 session.on_change(sliders[row], functools.partial(self._slide, row), f"move {row}")
         self._sliders = [sliders[row] for row in range(robot.dof)]
         self._mark_slider()
-        rows = {control_id(slider): str(row) for row, slider in enumerate(self._sliders)}
-        session.run_script(call("watch", rows))
         session.show_state_later()
 
     def _slide(self, row: int) -> None:
@@ -265,19 +260,6 @@ class RobotPage:
                 f"background:{colour}22}}</style>"
             )
         self._mark.content = style
-
-    def _hover(self, text: str) -> None:
-        """Draw the axis and range of the joint whose slider has the pointer or the focus."""
-        row = parse_count(text, self.robot.dof)
-        self.show_range(row if row < self.robot.dof else None)
-
-    def show_range(self, row: int | None) -> None:
-        """Draw the axis and the range of a joint, given by its index in q; None removes them."""
-        if row != self._range_row:
-            self._range_row = row
-            with self.session.client.atomic():
-                joint = None if row is None else self.robot.independent_joints[row]
-                scene_overlays.show_range(self.view, joint)
 
     def _connect_links(self) -> None:
         """Let clicks in the scene select links, and drags turn their joints."""
@@ -331,11 +313,8 @@ class _LinkDrag:
             T_root_link = page.view.T_root_link[self._link]
             offset = np.array(event.start_position) - T_root_link[:3, 3]
             self._point = T_root_link[:3, :3].T @ offset
-            page.session.enqueue(lambda: page.show_range(self._row))
         self._target = np.array(event.end_position)
-        if event.phase == "end":
-            page.session.enqueue(lambda: page.show_range(None))
-        else:
+        if event.phase != "end":
             page.session.enqueue(self._follow, "drag link")
 
     def _follow(self) -> None:

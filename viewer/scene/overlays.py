@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Box
 from morphgen.model.kinematics import frame_positions, random_configurations
-from morphgen.model.robot import Joint, Link, Robot
+from morphgen.model.robot import Link, Robot
 from morphgen.model.rotation import Vec3
 from morphgen.typing import Array
 from morphgen.viewer.scene.robot import RobotView, robot_extent
@@ -222,11 +222,8 @@ def show_workspace(view: RobotView, points: Array, outside: Triangles, y: float)
 
 
 SELECTED: Rgb = (0, 190, 220)  # outline, slider and card of the link; red means collision only
-RANGE: Rgb = (250, 176, 5)  # range of a joint; its axis is orange or blue, as in the overlay
 _OUTLINE_COLOUR: Rgb = (60, 240, 255)  # brighter: the outline is in its link's shade
 _OUTLINE = 0.009  # thickness of the outline, in extents of the robot
-_RADIUS = 0.18  # radius of the arc that shows a range, in extents of the robot
-_ARC_STEPS = 48
 
 
 def show_outline(view: RobotView, link: int | None) -> None:
@@ -256,71 +253,3 @@ def show_outline(view: RobotView, link: int | None) -> None:
         )
         for i, (shape, (vertices, faces)) in enumerate(zip(shapes, surfaces, strict=True))
     ]
-
-
-def show_range(view: RobotView, index: int | None) -> None:
-    """Draw the axis and range of a joint on its parent link, and a needle on its child link."""
-    remove_overlay(view, "range")
-    if index is None:
-        return
-    robot, joint = view.robot, view.robot.joints[index]
-    parent, child = robot.parents[index + 1], index + 1
-    size = _RADIUS * robot_extent(robot)
-    needle, tracks, axis = range_lines(joint, size, _needle_direction(view, index))
-    T_parent_joint = joint.T_parent_joint
-
-    def add(name: str, node: int, lines: Array, colour: Rgb, thickness: float, *, at: bool) -> Any:  # noqa: ANN401
-        return view.scene.add_line_segments(
-            f"{view.name}/{node}/{name}",
-            lines,
-            colour,
-            thickness=thickness,
-            thickness_units="screen",
-            position=T_parent_joint.position if at else (0.0, 0.0, 0.0),
-            wxyz=T_parent_joint.quaternion if at else (1.0, 0.0, 0.0, 0.0),
-        )
-
-    view.overlays["range"] = [
-        add("range", parent, tracks, RANGE, 4.0, at=True),
-        add("range_axis", parent, axis, RANGE, 2.0, at=True),
-        add("range_needle", child, needle, SELECTED, 5.0, at=False),
-    ]
-
-
-def range_lines(joint: Joint, size: float, direction: Vec3) -> tuple[Array, Array, Array]:
-    """Return lines [m] of a needle in the child's frame, and of range and axis in the joint's."""
-    axis, side = np.array(joint.unit_axis), np.array(direction)
-    low, high = joint.effective_limits
-    axis_line = np.array([[-size * axis, size * axis]])
-    if joint.kind == "prismatic":
-        across = 0.15 * size * side
-        ticks = ([end * axis - across, end * axis + across] for end in (low, high))
-        track = np.array([[low * axis, high * axis], *ticks])
-        return np.array([[-2 * across, 2 * across]]), track, axis_line
-    high = min(high, low + 2 * np.pi)
-    angles = np.linspace(low, high, _ARC_STEPS + 1)
-    third = np.cross(axis, side)
-    points = size * (np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * third)
-    arc = np.stack([points[:-1], points[1:]], axis=1)
-    ends = np.array([[0.8 * points[0], points[0]], [0.8 * points[-1], points[-1]]])
-    needle = np.array([[0.7 * size * side, 1.25 * size * side]])
-    return needle, np.concatenate([arc, ends]), axis_line
-
-
-def _needle_direction(view: RobotView, index: int) -> Vec3:
-    """Return a direction across a joint's axis and the child's extent, which would hide lines."""
-    robot, axis = view.robot, np.array(view.robot.joints[index].unit_axis)
-    child = index + 1
-    candidates = [
-        np.array(joint.T_parent_joint.position)
-        for joint, parent in zip(robot.joints, robot.parents[1:], strict=True)
-        if parent == child
-    ]
-    inertial = robot.links[child].inertial
-    if inertial is not None:
-        candidates.append(np.array(inertial.com))
-    candidates += list(np.eye(3))
-    across = [point - (point @ axis) * axis for point in candidates]
-    best = next(vector for vector in across if np.linalg.norm(vector) > 1e-3)
-    x, y, z = (np.cross(axis, best) / np.linalg.norm(best)).tolist()
-    return (x, y, z)
