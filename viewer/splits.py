@@ -1,4 +1,4 @@
-"""New splits of robots in a gallery, and the survey of a split that its page shows."""
+"""New splits of chosen robots, and the survey of a split that its page shows."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ from morphgen.viewer.robot_uri import (
     shorten,
 )
 
-SAVED_REGIMES = tuple(regime for regime in REGIMES if regime != HOLD_OUT)
+_REGIMES = tuple(regime for regime in REGIMES if regime != HOLD_OUT)
 """Regimes of splits that the viewer saves; it has no controls for what a hold-out split says."""
 SPLITS = "splits"  # folder in which new splits are written
 MAX_NAME = 200  # longest name of a split [characters]
@@ -133,59 +133,27 @@ def conclude_study(
     )
 
 
-Sides = tuple[Sequence[Member], Sequence[Member]]  # members to train on, and members to test on
-ChooseSides = Callable[[], tuple[list[Row], list[Row]]]
-"""Function that returns the robots to train on and those to test on."""
-
-
 def add_split_form(
-    session: Session,
-    add_choice: Callable[[], ChooseSides],
-    hint: str = "",
-    *,
-    expanded: bool = False,
+    session: Session, choose_sides: Callable[[], tuple[list[Row], list[Row]]]
 ) -> None:
-    """Add controls that make a new split of robots, for a task that the user chooses."""
-    gui = session.client.gui
+    """Add controls that save a new split for a task, and show the command that audits it.
 
-    def add_task() -> Callable[[], Sides]:
-        if hint:
-            gui.add_html(markup.framed(markup.dim(hint)))
+    The function returns the robots to train on and those to test on.
+    """
+    gui = session.client.gui
+    with gui.add_folder("New split"):
+        name = gui.add_text("split name", "")
+        regime = gui.add_dropdown("regime", _REGIMES)
         task = gui.add_dropdown("task", tuple(TASKS))
         obstacles = gui.add_checkbox("obstacles", False)
-        choose_sides = add_choice()
-
-        def compose_sides() -> Sides:
-            """Compose the robots in the worker processes."""
-            make = partial(make_member, task.value, obstacles.value, session.files)
-            with session.activity("composing {} robots"):
-                train, test = (list(session.workers.map(make, rows)) for rows in choose_sides())
-            return train, test
-
-        return compose_sides
-
-    add_save_form(session, "New split", add_task, expanded=expanded)
-
-
-def add_save_form(
-    session: Session,
-    title: str,
-    add_sides: Callable[[], Callable[[], Sides]],
-    *,
-    regime: Regime = SAVED_REGIMES[0],
-    expanded: bool = False,
-) -> None:
-    """Add controls that save a split, and show the command that audits it."""
-    gui = session.client.gui
-    with gui.add_folder(title, expand_by_default=expanded):
-        name = gui.add_text("split name", "")
-        regimes = gui.add_dropdown("regime", SAVED_REGIMES, initial_value=regime)
-        find_sides = add_sides()
         text = gui.add_html("")
         button = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
 
     def save() -> None:
-        path = save_split(name.value, regimes.value, *find_sides(), session.files)
+        make = partial(make_member, task.value, obstacles.value, session.files)
+        with session.activity("composing {} robots"):
+            train, test = (list(session.workers.map(make, rows)) for rows in choose_sides())
+        path = save_split(name.value, regime.value, train, test, session.files)
         shown = str(path.relative_to(session.files.roots[0]))
         text.content = markup.framed(markup.code(f"morphgen split audit {shlex.quote(shown)}"))
         session.notify("Saved", shown)

@@ -261,6 +261,8 @@ def test_robots_are_chosen_compared_played_and_split(same, folder):
     page.get_by_text("morphgen split audit splits/from/tray.yaml").wait_for()
     split = read_split(folder / "splits" / "from" / "tray.yaml")
     assert [member.name for member in split.test] == ["prims-000005"]
+    press(page, "Save")
+    page.get_by_text(re.compile("exists; choose another name")).first.wait_for()
     with page.expect_download() as download:
         page.locator(TRAY).get_by_text("download").click()
     assert download.value.suggested_filename == "robots.zip"

@@ -4,11 +4,12 @@ import os
 import re
 import shutil
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from helpers.pages import field, nodes, pointer, press
+from helpers.pages import nodes, pointer
 from helpers.robots import arm
 from helpers.viser_client import PlainClient
 from morphgen.errors import BenchmarkError
@@ -24,7 +25,7 @@ from morphgen.viewer.controls import all_roles, joint_roles, normalized_position
 from morphgen.viewer.figures import heatmap_svg, histogram_svg, map_svg
 from morphgen.viewer.pages import population as populations
 from morphgen.viewer.pages.compare import compare_robots, similarity_table
-from morphgen.viewer.pages.gallery import choose_sides, parse_range
+from morphgen.viewer.pages.gallery import parse_range
 from morphgen.viewer.pages.population import (
     ReadRobot,
     find_source,
@@ -33,7 +34,7 @@ from morphgen.viewer.pages.population import (
     shape_poses,
 )
 from morphgen.viewer.robot_rows import Row
-from morphgen.viewer.robot_uri import FileAccess, UriError, read_robot_uri
+from morphgen.viewer.robot_uri import FileAccess, UriError, member_uri, read_robot_uri
 from morphgen.viewer.scene.robot import robot_bounds
 from morphgen.viewer.scene.stage import View, fit_camera, project_points
 from morphgen.viewer.splits import make_member, save_split
@@ -118,20 +119,6 @@ def test_dead_worker_is_reported_once_and_thumbnails_are_still_rendered(see, vie
     page.wait_for_function("document.querySelectorAll('.card img').length == 24")
     assert page.get_by_text("A worker died").count() <= 1
     assert page.locator(".card .empty").count() == 0
-
-
-@pytest.mark.slow
-def test_split_is_created_from_filtered_robots(see, folder):
-    page = see("?gallery=robots/prims&search=00000")
-    page.get_by_text("10 of 30 robots").wait_for()
-    page.get_by_text("New split").click()
-    for label, value in (("split name", "from/gallery"), ("to train on", "3"), ("to test on", "2")):
-        field(page, label).last.fill(value)
-    press(page, "Save")
-    page.get_by_text("morphgen split audit splits/from/gallery.yaml").wait_for()
-    split = read_split(folder / "splits" / "from" / "gallery.yaml")
-    assert [member.name for member in split.train] == [f"prims-{i:06d}" for i in range(3)]
-    assert [member.name for member in split.test] == ["prims-000010", "prims-000011"]
 
 
 @pytest.mark.parametrize(
@@ -521,22 +508,6 @@ def test_split_page_shows_both_sides_the_map_and_the_audit(see):
     assert page.failures == []
 
 
-@pytest.mark.slow
-def test_new_split_is_saved_from_the_shown_robots(see, folder):
-    page = see(f"?split={SPLIT}&search=0000")
-    page.get_by_text("train (10)").wait_for()
-    field(page, "Search").fill("000001")
-    page.get_by_text(re.compile("of 12 robots")).wait_for()
-    page.get_by_text("New split of what is shown").click()
-    field(page, "split name").fill("mine/ones")
-    press(page, "Save")
-    page.get_by_text("morphgen split audit splits/mine/ones.yaml").wait_for()
-    split = read_split(folder / "splits" / "mine" / "ones.yaml")
-    assert {member.name[-6:] for member in (*split.train, *split.test)} == {"000001"}
-    press(page, "Save")
-    page.get_by_text(re.compile("exists; choose another name")).first.wait_for()
-
-
 def test_robots_of_a_set_become_members(folder, files, monkeypatch):
     monkeypatch.chdir(folder)
     rows = [Row("", f"robots/prims/prims-{i:06d}", "prims") for i in range(4)]
@@ -545,15 +516,9 @@ def test_robots_of_a_set_become_members(folder, files, monkeypatch):
     split = read_split(path)
     assert split.train == tuple(members[:3])
     assert {member.task for member in split.train} == {"push"}
-
-
-def test_filter_separates_train_and_test_robots():
-    rows = [Row(name, name) for name in "abcdef"]
-    train, test = choose_sides(rows, rows[2:5], 2, 3)
-    assert [row.name for row in train] == ["c", "d"]
-    assert [row.name for row in test] == ["a", "b", "f"]
-    with pytest.raises(BenchmarkError, match="3 robots pass the filter and 3 do not: too few"):
-        choose_sides(rows, rows[2:5], 4, 1)
+    (member, *_) = read_split(find_split(SPLIT)).test
+    row = Row(member.name, member_uri(SPLIT, "test", member))
+    assert make_member("push", False, files, row) == replace(member, task="push")
 
 
 def test_empty_sides_and_invalid_names_are_rejected(files):

@@ -10,7 +10,7 @@ from typing import Any
 
 import viser
 
-from morphgen.errors import BenchmarkError, MorphgenError
+from morphgen.errors import MorphgenError
 from morphgen.formats.bundle import PICTURE
 from morphgen.grammar.grammar_file import grammar_names
 from morphgen.rl.demonstrations.lerobot import RECORDING
@@ -25,7 +25,7 @@ from morphgen.viewer.app.workers import WorkerDied
 from morphgen.viewer.controls import bind
 from morphgen.viewer.robot_files import Thumbnail, make_thumbnail, thumbnail_of_picture
 from morphgen.viewer.robot_uri import DEFAULT_WORDS, FileAccess
-from morphgen.viewer.splits import SPLITS, ChooseSides, add_split_form
+from morphgen.viewer.splits import SPLITS, add_split_form
 
 
 @dataclass(eq=False)
@@ -404,7 +404,7 @@ def show_library(session: Session) -> None:
 
 
 def show(session: Session) -> None:
-    """Build the page of a folder of robots, from which a new split can be made."""
+    """Build the page of a folder of robots."""
     if not session.address.subject:
         show_index(session)
         return
@@ -418,32 +418,6 @@ def show(session: Session) -> None:
     header = population + (f"<br>{links}" if links else "")
     open_panels(gallery, markup.breadcrumbs((folder, None)), header)
     add_controls(gallery)
-    hint = "train: pass the filter; test: do not"
-    add_split_form(session, lambda: _add_choice(gallery), hint)
-
-
-def choose_sides(
-    rows: list[robot_rows.Row], passing: list[robot_rows.Row], num_train: int, num_test: int
-) -> tuple[list[robot_rows.Row], list[robot_rows.Row]]:
-    """Return the first rows that pass the filter (train) and the first that do not (test)."""
-    uris = {row.uri for row in passing}
-    failing = [row for row in rows if row.uri not in uris]
-    if len(passing) < num_train or len(failing) < num_test:
-        raise BenchmarkError(
-            f"{len(passing)} robots pass the filter and {len(failing)} do not: too few for "
-            f"{num_train} to train on and {num_test} to test on"
-        )
-    return passing[:num_train], failing[:num_test]
-
-
-def _add_choice(gallery: Gallery) -> ChooseSides:
-    """Add the numbers of robots on the sides: those that pass the filter, and the others."""
-    gui = gallery.session.client.gui
-    num_train = gui.add_number("to train on", 10, min=1, step=1)
-    num_test = gui.add_number("to test on", 1, min=1, step=1)
-    return lambda: choose_sides(
-        gallery.rows, passing_rows(gallery), num_train.value, num_test.value
-    )
 
 
 def show_chosen(session: Session) -> None:
@@ -471,7 +445,7 @@ def show_chosen(session: Session) -> None:
         session.open_address(address, instead=True)
 
     add_controls(gallery)
-    add_split_form(session, lambda: sides, expanded=True)
+    add_split_form(session, sides)
     session.on_change(num_train, divide, "sides")
     session.on_choice = leave_out
 

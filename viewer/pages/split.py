@@ -10,15 +10,15 @@ import viser
 
 from morphgen.benchmark.audit import Audit
 from morphgen.encoding.similarity import MEASURES, classical_mds, to_distances
-from morphgen.splits.split import SIDES, Member, Split, split_id
+from morphgen.splits.split import SIDES, Split, split_id
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address
 from morphgen.viewer.app.session import Session
 from morphgen.viewer.figures import heatmap_svg, map_svg
 from morphgen.viewer.pages import gallery as gallery_page
 from morphgen.viewer.robot_rows import split_rows
-from morphgen.viewer.robot_uri import member_uri, resolve_member, resolve_split
-from morphgen.viewer.splits import SAVED_REGIMES, Sides, SplitStudy, add_save_form, study_split
+from morphgen.viewer.robot_uri import member_uri, resolve_split
+from morphgen.viewer.splits import SplitStudy, study_split
 
 PANEL_WIDTH = 520.0  # largest width of the controls [pixels]
 PANEL_SHARE = 0.36  # largest share of the window for the controls: names on the map stay readable
@@ -53,13 +53,6 @@ def show(session: Session) -> None:
     tabs = gui.add_tab_group()
     with tabs.add_tab("Robots", viser.Icon.ROBOT):
         gallery_page.add_controls(gallery)
-        regime = split.regime if split.regime in SAVED_REGIMES else SAVED_REGIMES[0]
-        add_save_form(
-            session,
-            "New split of what is shown",
-            lambda: lambda: _shown_sides(gallery),
-            regime=regime,
-        )
     texts = {}
     with panel.add_tab("Map", viser.Icon.MAP):
         panel.visible = True  # on a narrow window, too
@@ -179,10 +172,3 @@ def _draw_map(page: SplitPage) -> None:
         markup.dim(f"dark is more similar; {direction} is more similar"),
         heatmap_svg(values, names, sides, larger=larger),
     )
-
-
-def _shown_sides(gallery: gallery_page.Gallery) -> Sides:
-    sides: dict[str, list[Member]] = {side: [] for side in SIDES}
-    for row in gallery_page.passing_rows(gallery):
-        sides[row.role].append(resolve_member(row.uri, gallery.session.files))
-    return sides["train"], sides["test"]
