@@ -6,14 +6,13 @@
 The robots are all arms with all end-effectors of the library (arms with two flanges get two), and
 ``--n`` robots of each grammar, in an order that the seed shuffles, so that any beginning of the
 list is a sample of it. For each, ``morphgen conform`` compares the loaders, holds the home for 5 s
-in the simulators, steps each joint and lists the links that penetrate at home. ``--doctor`` names
-the command ``mjcf-doctor`` (a pip package of others, which needs no morphgen), which then checks
-the MJCF.
+in the simulators and lists the links that penetrate at home. ``--doctor`` names the command
+``mjcf-doctor`` (a pip package of others, which needs no morphgen), which then checks the MJCF.
 
 A row per robot goes to ``rows.csv`` in ``--out``. Robots that have a row are skipped, so an
 interrupted run resumes. ``--only`` keeps robots or groups whose name contains the text, ``--count``
 stops after as many new robots, ``--report`` only prints the tables of the stored rows. The exit
-code is 1 if a finding has no explanation.
+code is 1 if a loader disagrees.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ import argparse
 import csv
 import json
 import random
-import re
 import subprocess
 import sys
 import tempfile
@@ -34,6 +32,7 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from morphgen.api.checks import conform
+from morphgen.checks.hold import MAX_DRIFT
 from morphgen.formats.bundle import MJCF, write_bundle
 from morphgen.formats.files import write_file
 from morphgen.grammar.compose import compose
@@ -43,36 +42,10 @@ from morphgen.grammar.request import parse_request
 from morphgen.grammar.sampling import sample_robot
 
 ROWS = "rows.csv"
-MISFIT = "the hand reaches behind its flange into the arm; morphgen check warns of it"
-OVERLOAD = "hand and arm are heavier than the effort limit of the source carries"
-TOUCH = "links touch at home, and PyBullet enlarges meshes by 1 mm"
-MARGIN = "come within PyBullet's collision margin"
-"""Part of the cause of links that touch; see ``morphgen.checks.hold``."""
-PENETRATE = "penetrate by"
-"""Part of the cause of links that penetrate."""
-SOLVER = "PyBullet's solver has not converged; the robot holds with more iterations"
-HOLDS = "solver iterations"
-UNCOUPLED = "PyBullet ignores <mimic>"
-"""Part of the cause of mimic joints that leave their leaders."""
-CARRY = "to carry the weight"
-"""Part of the cause of a motor that is too weak; see ``morphgen.checks.hold.overloads``."""
-BECAUSE = ", because "
-"""Words between what goes wrong in a simulator and its causes."""
-WEAK = (
-    "the effort limits of the source are too small to settle in 3 s; ten times as much are enough"
-)
-SLOW = "joint damping and dry friction of the source slow the joints down"
-DAMPING = "PyBullet integrates joint damping explicitly, which turns light links on"
-COLLIDE = "a step leads links into each other"
 COMPOSED = "arm x end-effector"
 TWO_FLANGES = ("yumi",)
 """Arms with the ports ``left`` and ``right`` instead of ``flange``."""
-SIMULATORS = {
-    "mujoco (mjcf)": "mjcf",
-    "pybullet (urdf)": "urdf",
-    "mujoco (environment)": "mujoco",
-    "pybullet (environment)": "pybullet",
-}
+SIMULATORS = {"mujoco (mjcf)": "mjcf", "pybullet (urdf)": "urdf"}
 """Columns of the simulators, by the names of the rows of ``morphgen conform``."""
 
 
@@ -101,59 +74,19 @@ class Row:
     loaders: str
     """Differences of the loaders; empty if all agree."""
     mjcf: str
-    """In MuJoCo with ``robot.xml``: drift [rad or m], follower error [rad or m] and settling time
-    [s]; ``-`` for one that was not measured."""
+    """Drift in MuJoCo with ``robot.xml`` [rad or m]; ``-`` if it was not measured. Rows of earlier
+    versions have further numbers behind it."""
     urdf: str
     """The same in PyBullet with ``robot.urdf``."""
-    mujoco: str
-    """The same in an environment of MuJoCo."""
-    pybullet: str
-    """The same in an environment of PyBullet."""
-    moving: str
-    """Simulators in which a joint drifts too far or does not step, the joint and the causes."""
     penetrations: str
     """Pairs of links that penetrate at home, and their depth."""
     doctor: str
     """Errors and warnings of mjcf-doctor; ``-`` if it was not run."""
 
-    @property
-    def causes(self) -> dict[str, str]:
-        """The known cause, or nothing, by each of: ``loaders``, ``penetrations``, a simulator."""
-        causes = {"loaders": ""} if self.loaders else {}
-        misfit = MISFIT if self._is_misfit else ""
-        if self.penetrations:
-            causes["penetrations"] = misfit
-        for part in filter(None, self.moving.split(" | ")):
-            name, _, message = part.partition(": ")
-            words = message.partition(BECAUSE)[2]
-            collide = misfit or (COLLIDE if PENETRATE in words else "")
-            known = {
-                CARRY: OVERLOAD,
-                HOLDS: SOLVER,
-                UNCOUPLED: UNCOUPLED,
-                "joint damping": DAMPING if name.startswith("pybullet") else SLOW,
-                "dry friction": SLOW,
-                "effort limits": WEAK,
-                MARGIN: TOUCH,
-                PENETRATE: collide,
-            }
-            causes[SIMULATORS[name]] = next((known[key] for key in known if key in words), "")
-        return causes
-
-    @property
-    def _is_misfit(self) -> bool:
-        """Whether all penetrations at home are between a hand and the arm that carries it."""
-        pairs = [re.match(r"(\S+), (\S+) ", pair) for pair in self.penetrations.split("; ")]
-        labels = [{link.split("_")[0] for link in pair.groups()} for pair in pairs if pair]
-        is_joint = all(
-            found in ({"arm", "ee"}, {"arm", "left"}, {"arm", "right"}) for found in labels
-        )
-        return self.group == COMPOSED and bool(labels) and is_joint
-
-    @property
-    def is_unexplained(self) -> bool:
-        """Whether a finding has no known cause."""
-        return not all(self.causes.values())
+    def holds(self, column: str) -> bool:
+        """Return whether the robot holds its home in a simulator."""
+        drift, *_ = getattr(self, column).split()
+        return drift != "-" and float(drift) < MAX_DRIFT  # stored drifts are rounded
 
 
 def main() -> int:
@@ -186,7 +119,7 @@ def main() -> int:
             rows.append(_measure(item, library, args))
             _append(file, rows[-1])
     _print(rows)
-    return int(any(row.is_unexplained for row in rows))
+    return int(any(row.loaders for row in rows))
 
 
 def _items(library: Library, n: int, seed: int) -> list[Item]:
@@ -216,11 +149,6 @@ def _measure(item: Item, library: Library, args: argparse.Namespace) -> Row:
         report = conform(folder, samples=args.samples, seed=args.seed)
         doctor = _doctor(folder / MJCF, args.doctor) if args.doctor else "-"
     holds = {row.simulator: row for row in report.holds}
-    moving = [
-        f"{row.simulator}: {row.message}" + (BECAUSE + "; ".join(row.causes) if row.causes else "")
-        for row in report.holds
-        if row.passed is False
-    ]
     return Row(
         group=item.group,
         robot=item.name,
@@ -229,14 +157,9 @@ def _measure(item: Item, library: Library, args: argparse.Namespace) -> Row:
         dof=robot.dof,
         loaders="; ".join(f"{r.loader}: {r.message}" for r in report.rows if r.passed is False),
         **{
-            column: " ".join(
-                "-" if value is None else f"{value:.2g}"
-                for value in (row.drift, row.follower_error, row.settling_time)
-            )
+            column: "-" if holds[name].drift is None else f"{holds[name].drift:.2g}"
             for name, column in SIMULATORS.items()
-            for row in (holds[name],)
         },
-        moving=" | ".join(moving),
         penetrations="; ".join(
             f"{pair} {1000 * depth:.2g} mm" for pair, depth in report.penetrations.items()
         ),
@@ -268,7 +191,11 @@ def _read(file: Path) -> list[Row]:
         stored = list(csv.DictReader(stream))
     numbers = ("seed", "links", "dof")
     complete: list[dict[str, Any]] = [row for row in stored if None not in row.values()]
-    return [Row(**(row | {name: int(row[name]) for name in numbers})) for row in complete]
+    names = [field.name for field in fields(Row)]  # rows of earlier versions have more
+    return [
+        Row(**({name: row[name] for name in names} | {name: int(row[name]) for name in numbers}))
+        for row in complete
+    ]
 
 
 def _drop_cut_off_row(file: Path) -> None:
@@ -280,9 +207,12 @@ def _drop_cut_off_row(file: Path) -> None:
 
 def _append(file: Path, row: Row) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
-    is_new = not file.exists()
+    is_new, names = not file.exists(), [field.name for field in fields(Row)]
+    if not is_new:  # an earlier version may have written the file, with more columns
+        with file.open(newline="", encoding="utf-8") as stream:
+            names = next(csv.reader(stream))
     with file.open("a", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, [field.name for field in fields(Row)], lineterminator="\n")
+        writer = csv.DictWriter(stream, names, lineterminator="\n")
         if is_new:
             writer.writeheader()
         writer.writerow(asdict(row))
@@ -292,57 +222,8 @@ def _print(rows: list[Row]) -> None:
     groups = sorted({row.group for row in rows}, key=lambda group: (group != COMPOSED, group))
     table = [_summary(group, [row for row in rows if row.group == group]) for group in groups]
     print(tabulate([*table, _summary("all", rows)], headers="keys", disable_numparse=True))
-    causes = sorted({cause for row in rows for cause in row.causes.values()})
-    explained = [_by_cause(cause, rows) for cause in causes if cause]
-    if explained:
-        print("\n" + tabulate(explained, headers="keys", disable_numparse=True))
-    parts = [
-        _followers(part, rows)
-        for part in sorted({_part(row) for row in rows if any(_follower_errors(row).values())})
-    ]
-    if parts:
-        print("\n" + tabulate(parts, headers="keys", disable_numparse=True))
-    for row in filter(lambda row: row.is_unexplained, rows):
-        print(f"UNEXPLAINED {row.robot}: {row.loaders} {row.moving} {row.penetrations}")
     for text, robots in sorted(_doctor_findings(rows).items()):
         print(f"mjcf-doctor: {text}: {len(robots)}, such as {', '.join(sorted(robots)[:3])}")
-
-
-def _by_cause(cause: str, rows: list[Row]) -> dict[str, object]:
-    found = sorted((row for row in rows if cause in row.causes.values()), key=lambda r: r.robot)
-    return {
-        "cause": cause,
-        "robots": len(found),
-        "do not move": sum(bool(row.moving) for row in found),
-        "penetrate": sum(bool(row.penetrations) for row in found),
-        "such as": ", ".join(row.robot for row in found[:3]),
-    }
-
-
-def _part(row: Row) -> str:
-    """Return the end-effector of a composed robot, or the grammar of a drawn one."""
-    return row.robot.rpartition("-")[2] if row.group == COMPOSED else row.group
-
-
-def _follower_errors(row: Row) -> dict[str, float]:
-    """Return the largest error of a mimic joint in each simulator in which the robot passes."""
-    passing = [column for column in SIMULATORS.values() if column not in row.causes]
-    errors = {column: getattr(row, column).split()[1] for column in passing}
-    return {column: float(error) for column, error in errors.items()}
-
-
-def _followers(part: str, rows: list[Row]) -> dict[str, object]:
-    """Return how far mimic joints of a part's robots are from their leaders while joints step."""
-    errors = [_follower_errors(row) for row in rows if _part(row) == part]
-    return {
-        "mimic joints of": part,
-        "robots": len(errors),
-        **{
-            f"{column} [rad or m]": f"{max(own):.2g} ({len(own)} pass)" if own else "none passes"
-            for column in SIMULATORS.values()
-            for own in ([error[column] for error in errors if column in error],)
-        },
-    }
 
 
 def _doctor_findings(rows: list[Row]) -> dict[str, list[str]]:
@@ -360,29 +241,13 @@ def _summary(group: str, rows: list[Row]) -> dict[str, object]:
         "robots": group,
         "number": len(rows),
         "loaders agree": sum(not row.loaders for row in rows),
-        **{f"moves: {column}": _passing(rows, column) for column in SIMULATORS.values()},
-        "follower off": _worst(rows, 1),
-        "settles": _worst(rows, 2),
+        **{
+            f"holds: {column}": sum(row.holds(column) for row in rows)
+            for column in SIMULATORS.values()
+        },
         "penetrate": sum(bool(row.penetrations) for row in rows),
-        "unexplained": sum(row.is_unexplained for row in rows),
         "doctor: clean": f"{sum(not row.doctor for row in tested)}/{len(tested)}",
     }
-
-
-def _passing(rows: list[Row], column: str) -> int:
-    """Return how many robots hold their home and step from it in a simulator."""
-    return sum(column not in row.causes for row in rows)
-
-
-def _worst(rows: list[Row], item: int) -> str:
-    """Return the worst value of the robots that pass in a simulator, over all simulators."""
-    values = [
-        getattr(row, column).split()[item]
-        for row in rows
-        for column in SIMULATORS.values()
-        if column not in row.causes
-    ]
-    return max(values, key=float, default="-")
 
 
 if __name__ == "__main__":

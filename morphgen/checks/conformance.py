@@ -96,10 +96,10 @@ class ConformanceReport:
     seed: int  # seed of the configurations
     passed: bool
     """Whether every installed loader agrees on the bundle and, if measured, the robot holds its
-    home and steps from it."""
+    home."""
     rows: tuple[ConformanceRow, ...]  # the loaders
     holds: tuple[HoldRow, ...] = ()
-    """The simulators in which the robot holds its home configuration, and steps from it."""
+    """The simulators in which the robot holds its home configuration."""
     penetrations: Mapping[str, float] = field(default_factory=dict)
     """Depth of every pair of links, as ``a, b``, that penetrate at home [m]; ignored pairs are not
     tested."""

@@ -446,11 +446,10 @@ def check_self_collision(robot: Robot) -> Iterator[Finding]:
         yield found("self-collision", f"links {a}, {b}", millimetres=1000 * depth)
 
 
-def home_penetrations(robot: Robot, margin: float = 0.0) -> dict[Pair, float]:
+def home_penetrations(robot: Robot) -> dict[Pair, float]:
     """Return the pairs of links that penetrate each other at home, with their depth [m].
 
-    Links nearer than ``margin`` [m] count, with a negative depth. Unreadable shapes are left out,
-    and a robot without valid joint axes and positions is not tested.
+    Unreadable shapes are left out. A robot without valid joint axes and positions is not tested.
     """
     if not _has_home_pose(robot):
         return {}
@@ -460,7 +459,7 @@ def home_penetrations(robot: Robot, margin: float = 0.0) -> dict[Pair, float]:
         return replace(link, collisions=valid)
 
     testable = robot.with_links(map(with_valid_collisions, robot.links))
-    checker = SelfCollisionChecker(testable, untested_pairs(testable), margin)
+    checker = SelfCollisionChecker(testable, untested_pairs(testable))
     return next(checker.penetrations([robot.home]))
 
 

@@ -43,16 +43,12 @@ shapes on parallel slides as they are. Even the largest offset is below ``PENETR
 class SelfCollisionChecker:
     """A robot's collision shapes, compiled once and tested at many configurations."""
 
-    def __init__(
-        self, robot: Robot, ignore: Iterable[Pair] | None = None, margin: float = 0.0
-    ) -> None:
-        """Compile the model; links nearer than the margin [m] count, with a negative depth."""
+    def __init__(self, robot: Robot, ignore: Iterable[Pair] | None = None) -> None:
+        """Compile the model."""
         import mujoco  # here, because commands that test no collisions should start quickly
 
         self._robot = robot
         self._model = _compile(robot, robot.ignore_pairs if ignore is None else ignore)
-        self._model.geom_margin[:] = margin
-        self._limit = margin if margin > 0 else -PENETRATION
         self._data = mujoco.MjData(self._model)
         self._geom_links = [
             robot.links[int(self._model.body(i).name)].name
@@ -121,7 +117,7 @@ class SelfCollisionChecker:
             )
         contact = self._data.contact
         for (a, b), distance in zip(contact.geom.tolist(), contact.dist.tolist(), strict=True):
-            if distance < self._limit:
+            if distance < -PENETRATION:
                 pair = sorted_pair(self._geom_links[a], self._geom_links[b])
                 depths[pair] = max(depths.get(pair, -distance), -distance)
         return depths

@@ -137,9 +137,6 @@ _SIMULATOR_COLUMNS = {
     "passed": "passed",
     "drift": "drift",
     "joint": "joint",
-    "step off": "step_error",
-    "follower off": "follower_error",
-    "settles in s": "settling_time",
 }
 """Fields of ``HoldRow`` by the titles of their columns."""
 _MAX_CELL = 22  # number of characters of a robot's or joint's name in a table
@@ -162,7 +159,6 @@ def _conformance_text(reports: Mapping[str, ConformanceReport]) -> str:
                         )
                     )
                     notes.append(f"{name}, {where}: {one_line(row.message)}"[:_MAX_NOTE])
-                notes += [f"    cause: {cause}"[:_MAX_NOTE] for cause in getattr(row, "causes", ())]
         # In the style plain, the titles are not padded to more than 120 columns.
         lines = [list(row.values()) for row in rows]
         text = table(lines, ("robot", *columns), style="plain", last=("joint",)) if rows else ""

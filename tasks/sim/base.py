@@ -349,8 +349,6 @@ class Simulator:
     """Types of the devices that its tensors can be on, as of ``torch.device.type``."""
     simulates_contacts: bool = True
     """Whether the simulator has contacts; one without takes no scenes with a block or obstacles."""
-    contact_margin: float = 0.0
-    """Distance within which convex meshes push each other away, although they do not touch [m]."""
     takes_workers: bool = True
     """Whether processes or threads share its work; one without steps all environments at once."""
     worker_envs: int = 0

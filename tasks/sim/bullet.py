@@ -27,7 +27,6 @@ from morphgen.tasks.sim.bullet_batch import (
     consecutive,
 )
 from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
-from morphgen.typing import Array
 
 _BASE_LOAD = 5  # cost of stepping an environment without joints, in joints
 
@@ -90,10 +89,6 @@ class BulletSimulation(HostSimulation):
         """Free the clients and end the workers; a second call does nothing."""
         super().close()
         self._free()
-
-    def movable_q(self, env: int) -> Array:
-        """Return the positions of all movable joints of an environment of this process."""
-        return self.batch.movable_q(env)
 
     def _put(
         self,
@@ -180,5 +175,4 @@ SIMULATOR = Simulator(
     lambda scenes, contacts, workers, _: BulletSimulation(scenes, contacts, processes=workers),
     native_step=("pybullet", "stepSimulation"),
     max_envs=128,  # an environment takes 36 MB
-    contact_margin=1e-3,  # by which it enlarges convex meshes of a URDF
 )

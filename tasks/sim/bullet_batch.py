@@ -604,10 +604,6 @@ class BulletBatch:
             is_sane = is_sane and is_within(blocks, MAX_VELOCITY)
         return {} if is_sane else self._find_diverged()
 
-    def movable_q(self, i: int) -> Array:
-        """Return the positions of all movable joints of a scene, mimic joints included."""
-        return self._positions[self._spans[i]].copy()
-
     def _undisturbed(self, desired: Array) -> tuple[Array, Array]:
         """Return positions and velocities at the end of a control step without disturbances.
 

@@ -279,10 +279,6 @@ class MujocoSimulation(HostSimulation):
             self._pool.shutdown()
         self._pool, self._work = None, []
 
-    def movable_q(self, env: int) -> Array:
-        """Return the positions of all movable joints of an environment, mimic joints included."""
-        return np.array(self._data[env].qpos[self._worlds[env].movable_q_at])
-
     def _put(
         self, envs: NDArray[np.int64], q: Array, object_pose: Array, obstacle_poses: Array | None
     ) -> None:

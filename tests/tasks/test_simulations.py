@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.faulty_robots import with_joint, with_link
+from helpers.faulty_robots import with_joint
 from helpers.joint_targets import SECOND, drive, held, smooth_walk
 from helpers.resets import homes, put_home, reset_envs, state
 from helpers.robots import arm, finger
@@ -23,7 +23,6 @@ from helpers.scenes import (
     robot,
 )
 from helpers.simulators import PYBULLET, needs_pybullet
-from morphgen.api.robots import compose
 from morphgen.checks.self_collision import adjacent_pairs, untested_pairs
 from morphgen.errors import SimulationError
 from morphgen.formats.mjcf.write import to_spec
@@ -31,7 +30,7 @@ from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import default_library
 from morphgen.grammar.sampling import sample_robot
 from morphgen.model.dynamics import BANDWIDTH, armature, mass_matrix, movable_mass_matrix
-from morphgen.model.geometry import Pose, Shape, Sphere
+from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import (
     forward_kinematics,
     frame_pose,
@@ -39,9 +38,7 @@ from morphgen.model.kinematics import (
     movable_positions,
 )
 from morphgen.model.robot import Inertial, Joint, Link, Mimic, Robot
-from morphgen.model.tree import subtree
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.hold_home import hold_in_environment
 from morphgen.tasks.registry import SIMULATORS
 from morphgen.tasks.scenes.env_specs import load_robot
 from morphgen.tasks.sim import mujoco_model
@@ -751,70 +748,51 @@ def in_mjcf(body, targets):
         yield data.qpos[joints].copy()
 
 
+def movable_q(simulation):
+    """Return the positions of all movable joints, mimic joints included."""
+    if isinstance(simulation, MujocoSimulation):
+        return simulation._data[0].qpos[simulation._worlds[0].movable_q_at].copy()
+    return simulation.batch._positions.copy()
+
+
 def in_environment(simulation, targets):
     for _ in range(SECOND):
         assert not simulation.step(torch.tensor(targets[None], dtype=torch.float32)).any()
-        yield simulation.movable_q(0)
+        yield movable_q(simulation)
     assert simulation.q[0].numpy() == pytest.approx(targets, abs=MAX_ERROR)
+
+
+def steps_from_home(body):
+    for joint, k in enumerate(body.independent_joints):
+        targets, limits = np.array(body.home), body.joints[k].limits
+        targets[joint] += 0.2 if limits is None or targets[joint] + 0.2 < limits[1] else -0.2
+        yield targets
+
+
+def assert_followers_stay(body, steps):
+    matrix, offset = body.mimic_map
+    leaders = [body.movable_joints.index(k) for k in body.independent_joints]
+    path = np.array(list(steps))
+    assert np.abs(path - path[:, leaders] @ matrix.T - offset).max() < MAX_ERROR
 
 
 @pytest.mark.parametrize("sim", ["mjcf", *WITH_CONTACTS])
 @pytest.mark.parametrize("name", ROBOTS)
 def test_followers_stay_with_their_leaders_when_a_joint_steps(load_in, name, sim):
     body = ROBOTS[name]()
-    matrix, offset = body.mimic_map
-    leaders = [body.movable_joints.index(k) for k in body.independent_joints]
-    for joint, k in enumerate(body.independent_joints):
-        targets, limits = np.array(body.home), body.joints[k].limits
-        targets[joint] += 0.2 if limits is None or targets[joint] + 0.2 < limits[1] else -0.2
+    for targets in steps_from_home(body):
         if sim == "mjcf":
             steps = in_mjcf(body, targets)
         else:
             steps = in_environment(load_in(sim, Scene(body), contacts=NOTHING_TOUCHES), targets)
-        path = np.array(list(steps))
-        assert np.abs(path - path[:, leaders] @ matrix.T - offset).max() < MAX_ERROR
-
-
-@pytest.mark.parametrize("sim", WITH_CONTACTS)
-def test_an_arm_holds_home_and_steps(sim):
-    row = hold_in_environment(subtree(arm(), "base", without=["left", "right"]), sim)
-    assert (row.simulator, row.passed, row.message) == (f"{sim} (environment)", True, "")
-    assert row.drift < 1e-5
-    assert row.step_error < 1e-3
-    assert 0.1 < row.settling_time < 0.5
-
-
-def test_mimic_joints_are_read_from_the_simulation(monkeypatch):
-    """The environment's own positions are those of the leaders only."""
-    real, shift = MujocoSimulation.movable_q, [0, 0, 0, 0, 0.01]
-    monkeypatch.setattr(MujocoSimulation, "movable_q", lambda *args: np.add(real(*args), shift))
-    row = hold_in_environment(arm(), "mujoco")
-    assert (row.joint, row.drift) == ("right", pytest.approx(0.01, rel=1e-3))
-
-
-@pytest.mark.parametrize("sim", WITH_CONTACTS)
-def test_links_that_penetrate_at_home_move_the_arm(sim):
-    ball = Shape(Sphere(0.1), Pose((0.0, 0.0, 0.05)))  # reaches into the base
-    body = with_link(arm(), "slider", collisions=(Shape(Sphere(0.7)), ball))
-    row = hold_in_environment(body, sim)
-    assert row.passed is False
-    assert row.drift is None or row.drift > 0.02
-
-
-@needs_pybullet
-def test_links_that_touch_at_home_are_named():
-    """The fingers of this robot stand on the flange of the wrist, without penetrating it."""
-    body = compose("jaco2_6dof-hand")
-    assert hold_in_environment(body, "mujoco").passed
-    row = hold_in_environment(body, "pybullet")
-    assert row.passed is False
-    margin = "come within PyBullet's collision margin, to 0.0034 mm"
-    assert f"arm_j2n6s300_link_5, ee_f0_proximal {margin}" in row.causes
+        assert_followers_stay(body, steps)
 
 
 @needs_pybullet
 @pytest.mark.parametrize("arm_name", ["xarm7", "ur3", "iiwa14"])
-def test_light_fingers_stay_with_their_leader_when_the_arm_swings_them(arm_name):
+def test_light_fingers_stay_with_their_leader_when_the_arm_swings_them(load_in, arm_name):
     """Its fingertips are light: what parts them from their leader is mostly centrifugal force."""
-    row = hold_in_environment(compose(f"arm={arm_name} ee=tiago_pro_gripper"), "pybullet")
-    assert row.follower_error < 0.02
+    body = robot(f"arm={arm_name} ee=tiago_pro_gripper")
+    for targets in steps_from_home(body):
+        simulation = load_in("pybullet", Scene(body), contacts=NOTHING_TOUCHES)
+        assert_followers_stay(body, in_environment(simulation, targets))
