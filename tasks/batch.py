@@ -20,7 +20,6 @@ from morphgen.tasks.observation import (
     copied,
 )
 from morphgen.tasks.random_numbers import EpisodeRandom, EpisodeSequence, Stream
-from morphgen.tasks.reset_options import place_episodes
 from morphgen.tasks.scenes.obstacles import LayoutSide
 from morphgen.tasks.scenes.robot_tables import RobotTables
 from morphgen.tasks.sim.base import Simulation, is_host
@@ -198,11 +197,7 @@ class TaskBatch:
         return self.groups.fields(self.simulation.object_pose)[name]
 
     def reset(
-        self,
-        seed: int | Sequence[int] | None = None,
-        *,
-        spread: bool = False,
-        options: Mapping[str, Any] | None = None,
+        self, seed: int | Sequence[int] | None = None, *, spread: bool = False
     ) -> Observation:
         """Begin an episode in every environment.
 
@@ -212,23 +207,13 @@ class TaskBatch:
                 those of environment 0 of a batch with that seed.
             spread: Whether these first episodes begin at random fractions of their time limit, so
                 that they do not all end at the same step; for learners.
-            options: Where these first episodes begin: joint positions ``q`` and, depending on the
-                task, ``goal`` or ``block`` (``Task.reset_options``); a vector for all environments,
-                or one for each. The rest is drawn as always.
 
         Raises:
-            TaskError: If a seed is out of range, or an option is invalid. The same episodes are
-                then still the next.
+            TaskError: If a seed is out of range.
         """
-        before = self.state_dict() if options else {}  # an option that is refused costs no episode
         if seed is not None:
             self._episodes.restart(seed, torch.zeros_like(self._episodes.next_episode))
-        try:
-            random = self._begin(torch.ones_like(self.episode_step, dtype=torch.bool), options)
-        except TaskError:
-            if before:
-                self.load_state_dict(before)
-            raise
+        random = self._begin(torch.ones_like(self.episode_step, dtype=torch.bool))
         if spread:
             self.episode_step.copy_(random.integers(Stream.SPREAD, self.max_episode_steps))
         return self.observe()
@@ -379,17 +364,12 @@ class TaskBatch:
             task_state.tool_rotation = T_root_tool[:, :3, :3]
         return self.groups.evaluate(task_state)
 
-    def _begin(self, mask: torch.Tensor, options: Mapping[str, Any] | None = None) -> EpisodeRandom:
-        """Begin episodes in some environments, (n,), bool; return their random numbers.
-
-        ``options`` are those of ``reset``, where all environments begin.
-        """
+    def _begin(self, mask: torch.Tensor) -> EpisodeRandom:
+        """Begin episodes in some environments, (n,), bool; return their random numbers."""
         random = self._episodes.begin(mask)
         self.layouts.draw(mask, random)
         layout = self.layouts.current if self.layouts.any else None
         q, object_pose = self.groups.begin(mask, random, layout)
-        if options:
-            q, object_pose = place_episodes(options, self.groups, self.layouts, q, object_pose)
         self.observation.begin(mask, random)
         obstacles = (self.layouts.poses,) if self.layouts.any else ()
         sim_q = q[:, : self._num_sim_joints].contiguous()

@@ -26,7 +26,6 @@ from morphgen.typing import Array
 if TYPE_CHECKING:  # tasks are also used by processes that need no torch, which is slow to load
     import torch
 
-    from morphgen.tasks.free_space import FreeSpace
     from morphgen.tasks.random_numbers import EpisodeRandom
 
 
@@ -295,28 +294,6 @@ class TaskEnvs(ABC):
         """
         return object_pose.new_zeros(len(object_pose), 0, 3)
 
-    def place(
-        self, row: int, options: Mapping[str, Array], space: FreeSpace, q: Array, object_pose: Array
-    ) -> tuple[Array, Array]:
-        """Begin an episode that ``begin`` has drawn as ``reset(options=...)`` asks for.
-
-        The caller requires afterwards that the start is free of collisions.
-
-        Args:
-            row: The environment.
-            options: Vectors of finite numbers: of ``Task.reset_options``, and perhaps ``q``.
-            space: The robot in the scene of the episode, for tests of collisions.
-            q: Joint positions at the start: those of the option ``q``, or drawn; shape (dof,).
-            object_pose: Pose of the object at the start, shape (7,); zeros without one.
-
-        Returns:
-            Joint positions and pose of the object at the start.
-
-        Raises:
-            TaskError: If an option cannot be met; the message says why.
-        """
-        return q, object_pose
-
     def target_rotations(self) -> torch.Tensor | None:
         """Return orientations for the tool, shape (k, 3, 3); None if the task wants none."""
         return None
@@ -363,9 +340,6 @@ class Task(ABC, Generic[C, G]):
     """Whether the reported score is the difference from the random policy's score."""
     relative_distance: bool = True
     """Whether the final distance is also reported relative to the robot's reach."""
-    reset_options: Mapping[str, tuple[int, ...]] = {}
-    """Options of ``reset`` besides ``q``, which ``TaskEnvs.place`` obeys, with the lengths that
-    their vectors may have."""
     goal_field: str = ""
     """Observation field that begins with the desired goal of ``goal_env=True``; empty for a task
     without that form."""

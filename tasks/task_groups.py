@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
-from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.kinematic_channels import ToolTargets
 from morphgen.tasks.random_numbers import EpisodeRandom
 from morphgen.tasks.registry import TASKS
@@ -25,7 +24,6 @@ from morphgen.tasks.task import (
     TaskState,
     require_returned,
 )
-from morphgen.typing import Array
 
 _FLAGS, _NUMBERS = ("success", "terminated"), ("distance", "score")
 
@@ -173,22 +171,6 @@ class TaskGroups:
         merged = self._merged(starts)
         return merged["q"], merged["object_pose"]
 
-    @property
-    def reset_options(self) -> dict[str, tuple[int, ...]]:
-        """Options of ``reset`` that all tasks of the batch have; see ``Task.reset_options``."""
-        first, *others = [group.task.reset_options for group in self._groups.values()]
-        return {
-            name: sizes
-            for name, sizes in first.items()
-            if all(other.get(name) == sizes for other in others)
-        }
-
-    def place(
-        self, env: int, options: Mapping[str, Array], space: FreeSpace, q: Array, object_pose: Array
-    ) -> tuple[Array, Array]:
-        """Begin an episode as options ask for; see ``TaskEnvs.place``."""
-        return self._envs_of(env).place(int(self._row[env]), options, space, q, object_pose)
-
     def evaluate(
         self, state: TaskState[torch.Tensor]
     ) -> tuple[StepResult[torch.Tensor], torch.Tensor]:
@@ -254,10 +236,8 @@ class TaskGroups:
 
     def marker_poses(self, env: int) -> dict[str, NDArray[np.float32]]:
         """Return the pose of each marker of an environment's task, shape (7,) each."""
-        return self._envs_of(env).marker_poses(int(self._row[env]))
-
-    def _envs_of(self, env: int) -> TaskEnvs:
-        return next(each.envs for each in self._groups.values() if bool((each.rows == env).any()))
+        envs = next(g.envs for g in self._groups.values() if bool((g.rows == env).any()))
+        return envs.marker_poses(int(self._row[env]))
 
     def advance(self, progress: float) -> None:
         """Advance the curricula; the progress of the training is from 0 to 1."""

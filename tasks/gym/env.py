@@ -287,20 +287,16 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NumpyObservation, dict[str, Any]]:
-        """Begin an episode: the next one, or with a seed the first; the very first is random.
-
-        options: Where this episode begins: joint positions ``q``, for reach a ``goal`` of the
-            tool (a position, or a pose with a quaternion wxyz), for push the position or pose
-            of the ``block``; all in the root frame. The rest is drawn as always.
-        """
+        """Begin an episode: the next one, or with a seed the first; the very first is random."""
         self._require_open()
+        self._require_no_options(options)
         super().reset(seed=seed)
         if seed is None and not self._was_reset:
             seed = int(self.np_random.integers(2**63))  # Gymnasium: the first reset is random
         self._running = False
-        next_has_begun = self._next_has_begun and seed is None and not options
+        next_has_begun = self._next_has_begun and seed is None
         observation = self._without_padding(
-            self.batch.observe() if next_has_begun else self.batch.reset(seed, options=options)
+            self.batch.observe() if next_has_begun else self.batch.reset(seed)
         )
         if self._stepper is not None:
             self._stepper.begin(observation)

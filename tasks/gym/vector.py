@@ -195,6 +195,10 @@ class BatchEnv:
         if self.closed:
             raise TaskError("this environment is closed")
 
+    def _require_no_options(self, options: Mapping[str, Any] | None) -> None:
+        if options:
+            raise TaskError(f"reset: options {options!r}: expected none; a seed sets the episodes")
+
     def _require_running(self) -> None:
         self._require_open()
         if not self._running:
@@ -301,6 +305,7 @@ class TaskVector(BatchEnv, VectorEnv[NumpyObservation, Array, Array]):
     ) -> tuple[NumpyObservation, dict[str, Any]]:
         """Begin an episode everywhere."""
         self._require_open()
+        self._require_no_options(options)
         super().reset(seed=seed if isinstance(seed, int) else None)
         seeds: int | list[int] | None = None
         if isinstance(seed, Sequence | np.ndarray):
@@ -313,7 +318,7 @@ class TaskVector(BatchEnv, VectorEnv[NumpyObservation, Array, Array]):
         elif seed is not None:
             seeds = whole_number("seed", seed, TaskError)
         self._running = False
-        observation = self._numpy(self.batch.reset(seeds, options=options))
+        observation = self._numpy(self.batch.reset(seeds))
         self._running, self._final_states = True, {}
         self._ended[:] = False
         return observation, {}

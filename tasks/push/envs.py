@@ -9,12 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.observation import box_tokens
 from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.push.starts import PushStartSet, require_pushable
+from morphgen.tasks.push.starts import PushStartSet
 from morphgen.tasks.random_numbers import EpisodeRandom, Stream
-from morphgen.tasks.reset_options import unit_quaternion
 from morphgen.tasks.rows import (
     GoalChoices,
     choose,
@@ -32,7 +30,6 @@ from morphgen.tasks.task import (
     TaskEnvs,
     TaskState,
 )
-from morphgen.typing import Array
 
 GAP = 0.05
 """Distance from a face of an object to the point before contact [m], tuned on arm3 and ee-arm."""
@@ -102,25 +99,6 @@ class PushEnvs(TaskEnvs):
         number = random.integers(Stream.START, self._choices.count(layout))
         start = self._choices.goals(layout, number[:, None])[:, 0]
         return self._q[self._env_spec_index, start], self._blocks[self._env_spec_index, start]
-
-    def place(
-        self, row: int, options: Mapping[str, Array], space: FreeSpace, q: Array, object_pose: Array
-    ) -> tuple[Array, Array]:
-        """Put the block where the option ``block`` says: a position, or a pose.
-
-        Unless ``q`` is given, too, a drawn start that the block would touch gives way to another.
-        """
-        if (wanted := options.get("block")) is None:
-            return q, object_pose
-        turn = object_pose[3:] if len(wanted) == 3 else unit_quaternion(wanted[3:], "block")
-        block = np.concatenate([wanted[:3], turn])
-        sets = self._env_spec_index[row]
-        require_pushable(space, block, float(self._final_line[row]))
-        if "q" in options or space.free(q[None], block[None])[0]:
-            return q, block
-        starts = self._q[sets, :, : len(q)].cpu().double().numpy()
-        free = space.free(starts, np.tile(block, (len(starts), 1)))
-        return starts[int(free.argmax())], block
 
     def target_points(self, object_pose: torch.Tensor) -> torch.Tensor:
         """Return a point behind the block, its centre, and its centre beyond the line."""

@@ -328,7 +328,7 @@ def _yaws(blocks: Array) -> Array:
 TRIES = 30  # poses of the block to test per required start before giving up
 RESTS = 1e-6  # largest height above the ground of a block that stands on it [m]
 
-_STANDS = 1e-3  # tolerance of a block that stands upright on the ground [m, and of a quaternion]
+
 _CONFIGURATIONS = 1000  # free configurations to test for a start before giving up
 
 
@@ -406,28 +406,6 @@ def draw_feasible(
         f"({region.y[0]:.3g}, {region.y[1]:.3g}) are feasible (acceptance rate "
         f"{len(starts) / tried:.2g}), {needed} are needed; {reasons}"
     )
-
-
-def require_pushable(space: FreeSpace, block: Array, line: float) -> None:
-    """Require a pose (7,) of the block from which the robot can push it, as ``Push.sample``."""
-    assert space.scene.block is not None
-    edge, ground = space.scene.block.size[0], space.scene.ground or 0.0
-    x, y, z, _, qx, qy, _ = block.tolist()
-    what = f"option 'block' at ({x:g}, {y:g}, {z:g})"
-    if abs(z - ground - edge / 2) > _STANDS or abs(qx) > _STANDS or abs(qy) > _STANDS:
-        raise TaskError(
-            f"{what}: expected a block that stands upright on the ground, its centre at z = "
-            f"{ground + edge / 2:g}"
-        )
-    if y >= line:
-        raise TaskError(f"{what} is across the line, which is at y = {line:g}")
-    region = Region(edge, 1.0, (x, x), (y, y), line)
-    test = FeasibilityTest(space, region, np.random.default_rng(0))(block[None])
-    if not test.path_is_clear[0]:
-        raise TaskError(f"{what}: something stands in the block's way to the line")
-    for found, place in ((test.across, "to the line"), (test.behind, "behind the block")):
-        if not np.isfinite(found).all():
-            raise TaskError(f"{what}: no configuration was found that gets the tool {place}")
 
 
 def feasible_starts(pushes: PushStartSet, space: FreeSpace) -> NDArray[np.bool_]:

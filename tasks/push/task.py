@@ -44,7 +44,6 @@ class Push(ObjectTask[PushConfig, PushStartSet]):
     goal_format = 3
     cache_folder = "pushes-4"
     fields = (OBJECT, LINE)
-    reset_options: Mapping[str, tuple[int, ...]] = {"block": (3, 7)}
     goal_field = "line"
     target = "line"
     goal_files_readme = """\

@@ -2,29 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from morphgen.errors import TaskError
-from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import frame_pose, solve_pose_ik, solve_position_ik
 from morphgen.model.kinematics_torch import angle_between, matrix_from_quaternion
-from morphgen.model.robot import TOOL
-from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.random_numbers import EpisodeRandom, Stream
 from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.reset_options import unit_quaternion
 from morphgen.tasks.rows import GoalChoices, choose, padded_rows, row_norms
 from morphgen.tasks.task import A, EnvSpec, StepFormulas, StepResult, TaskEnvs, TaskState
-from morphgen.typing import Array
-
-_STARTS, _ITERATIONS = 32, 60
-"""Number of configurations from which inverse kinematics starts, and of its iterations."""
-_ARRIVED = 1e-3
-"""Largest distance of a tool from a goal that it reaches [m, and of rotation matrices]."""
 
 
 class ReachFormulas(StepFormulas[A]):
@@ -99,38 +87,6 @@ class ReachEnvs(TaskEnvs):
             self._goal_rotation.copy_(torch.where(rows[..., None], rotation, self._goal_rotation))
         return q[:, 0], torch.zeros_like(self.goal)
 
-    def place(
-        self, row: int, options: Mapping[str, Array], space: FreeSpace, q: Array, object_pose: Array
-    ) -> tuple[Array, Array]:
-        """Set the goal of the option ``goal``: a position, or a pose, that the tool can reach."""
-        if (wanted := options.get("goal")) is None:
-            return q, object_pose
-        if len(wanted) == 3 and self.needs_tool_rotation:
-            raise TaskError("option 'goal' has shape (3,); a goal that is a pose needs (7,)")
-        if len(wanted) == 7:
-            wanted = np.concatenate([wanted[:3], unit_quaternion(wanted[3:], "goal")])
-        robot = space.scene.robot
-        found = _reachable_configuration(
-            space,
-            wanted,
-            self._q[self._env_spec_index[row], :, : robot.dof].cpu().double().numpy(),
-            with_rotation=self.needs_tool_rotation,
-        )
-        if found is None:
-            x, y, z = wanted[:3]
-            what = "pose" if self.needs_tool_rotation else "position"
-            raise TaskError(
-                f"option 'goal' at ({x:g}, {y:g}, {z:g}): no configuration that is free of "
-                f"collisions with the tool at this {what} was found"
-            )
-        if len(wanted) == 3:  # any orientation does: that of the configuration
-            pose = Pose.from_matrix(frame_pose(robot, found[None])[0])
-            wanted = np.concatenate([wanted, pose.quaternion])
-        self.goal[row] = torch.from_numpy(wanted)
-        self.goal_configuration[row, : robot.dof] = torch.from_numpy(found)
-        self._goal_rotation[row] = matrix_from_quaternion(self.goal[row, 3:])
-        return q, object_pose
-
     def target_rotations(self) -> torch.Tensor | None:
         """Return the goals' rotation matrices, shape (k, 3, 3); None for goals of positions."""
         return self._goal_rotation if self.needs_tool_rotation else None
@@ -142,30 +98,6 @@ class ReachEnvs(TaskEnvs):
     def marker_poses(self, row: int) -> dict[str, NDArray[np.float32]]:
         """Return the pose of the goal."""
         return {"goal": np.array(self.goal[row].cpu().numpy())}
-
-
-def _reachable_configuration(
-    space: FreeSpace, goal: Array, starts: Array, *, with_rotation: bool
-) -> Array | None:
-    """Return a free configuration with the tool at a goal, (3,) or (7,), or None without one.
-
-    Inverse kinematics starts from the nearest of some configurations (n, dof).
-    """
-    robot = space.scene.robot
-    tools = frame_pose(robot, starts, TOOL)[:, :3, 3]
-    nearest = np.argsort(np.linalg.norm(tools - goal[:3], axis=1), kind="stable")[:_STARTS]
-    if with_rotation:
-        T_root_goal = Pose(tuple(goal[:3]), tuple(goal[3:])).matrix
-        q = np.array([solve_pose_ik(robot, T_root_goal, start) for start in starts[nearest]])
-        error = np.abs(frame_pose(robot, q, TOOL) - T_root_goal).max(axis=(1, 2))
-    else:
-        q, errors = solve_position_ik(
-            robot, starts[nearest], np.tile(goal[:3], (len(nearest), 1)), iterations=_ITERATIONS
-        )
-        error = np.linalg.norm(errors, axis=1)
-    arrived = np.flatnonzero(error < _ARRIVED)
-    free = arrived[space.free(q[arrived])]
-    return q[free[0]] if len(free) else None
 
 
 def is_near(config: ReachConfig, distance: A, angle: A | None = None) -> A:

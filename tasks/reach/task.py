@@ -98,7 +98,6 @@ class Reach(Task[ReachConfig, ReachGoalSet]):
     cache_folder = "goals-5"
     fields = (GOAL,)
     discrete_actions = True
-    reset_options: Mapping[str, tuple[int, ...]] = {"goal": (3, 7)}
     goal_field = "goal"
     goal_files_readme = """\
 - reach: `q` (n, dof) are configurations free of collisions without obstacles, and `poses` (n, 7) of

@@ -20,7 +20,6 @@ from morphgen.tasks.articulated.envs import GAP, ArticulatedFormulas, object_tab
 from morphgen.tasks.articulated.starts import PathFinder
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.goals.goal_sets import set_from_npz, set_npz
-from morphgen.tasks.gym.env import TaskEnv
 from morphgen.tasks.observation import NOISE, ObservationConfig
 from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach.config import ReachConfig
@@ -513,22 +512,6 @@ def test_points_lie_on_the_box_at_the_contact_point(task, make):
     away = (np.abs(local) - size / 2).max(axis=1)
     assert np.abs(away).max() < 5 * NOISE
     assert np.abs(away).mean() < NOISE
-
-
-@each_object
-def test_starts_of_the_caller_are_free_of_the_object(task, cache, opened):
-    env = opened(TaskEnv(task, robot(ROBOT), config=CONFIGS[task], cache=cache))
-    scene = env.env_spec.scene
-    env.reset(seed=0)
-    pose = env.batch.simulation.object_pose.double().numpy()
-    q, _ = FreeSpace(replace(scene, object=None)).sample(3000, np.random.default_rng(0))
-    space = FreeSpace(scene)
-    is_free = space.free(q, pose.repeat(len(q), axis=0))
-    env.reset(seed=0, options={"q": q[is_free][0]})
-    assert env.batch.q[0].numpy() == pytest.approx(q[is_free][0], abs=1e-6)
-    inside = q[~is_free & space.free(q)]  # of the link that moves, not of the base
-    with pytest.raises(TaskError, match="collides with itself or the scene"):
-        env.reset(seed=0, options={"q": inside[0]})
 
 
 @each_object
