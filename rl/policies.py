@@ -12,7 +12,6 @@ from morphgen.errors import TaskError
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.agents.encoder import Network
 from morphgen.rl.config import PolicyConfig
-from morphgen.rl.distributed import ALONE, ProcessGroup
 from morphgen.rl.observation_layout import (
     Head,
     Layout,
@@ -64,7 +63,7 @@ class RunningNormalizer(nn.Module):
         return normalized
 
     @torch.no_grad()
-    def update(self, observation: Observation, processes: ProcessGroup = ALONE) -> None:
+    def update(self, observation: Observation) -> None:
         """Include observations, tensors (m, ...), in the statistics.
 
         Chan, Golub and LeVeque, Algorithms for computing the sample variance, 1983: means and
@@ -73,23 +72,19 @@ class RunningNormalizer(nn.Module):
         if not self.vectors:
             return
         is_link = observation["links"][..., None].float()
-        own_count = is_link.sum()
+        count = is_link.sum()
         means, variances = [], []
         for name, _ in self.vectors:  # one by one, to need less memory
             values, rows = observation[name], (0, 1)
-            mean = (values * is_link).sum(dim=rows) / own_count
+            mean = (values * is_link).sum(dim=rows) / count
             means.append(mean)
-            variances.append(((values - mean).square() * is_link).sum(dim=rows) / own_count)
-        own = torch.cat([own_count[None], *means, *variances])
-        size = len(self.mean)
-        for statistics in processes.collect(own):
-            count, mean, variance = torch.split(statistics, [1, size, size])
-            total, difference = self.count + count, mean - self.mean
-            between = difference.square() * self.count * count / total
-            merged = (self.variance * self.count + variance * count + between) / total
-            self.variance.copy_(merged)
-            self.mean.add_(difference * count / total)
-            self.count.copy_(total[0])
+            variances.append(((values - mean).square() * is_link).sum(dim=rows) / count)
+        variance = torch.cat(variances)
+        total, difference = self.count + count, torch.cat(means) - self.mean
+        between = difference.square() * self.count * count / total
+        self.variance.copy_((self.variance * self.count + variance * count + between) / total)
+        self.mean.add_(difference * count / total)
+        self.count.copy_(total)
 
 
 class Actor(nn.Module):

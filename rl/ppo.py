@@ -13,8 +13,8 @@ import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -24,7 +24,6 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from morphgen.errors import TaskError
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.distributed import ALONE, ProcessGroup, UpdateMetrics
 from morphgen.rl.observation_layout import (
     fields_of,
     joint_entropy,
@@ -187,6 +186,41 @@ LEARN_METRICS = (
 """Metrics of the gradient steps of an update; see ``UpdateMetrics``."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class UpdateMetrics:
+    """Metrics of one update; means over its transitions unless said otherwise.
+
+    Those with a default need environments: cloning has none.
+    """
+
+    update: int  # number of updates so far, this one included
+    transitions: int  # control steps of all environments so far
+    reward: float  # mean reward of a control step
+    score: float = math.nan  # mean task score of a control step
+    scores: tuple[float, ...] = ()
+    """Mean score of each robot, or of the robots of each grammar if they are drawn; nan for one
+    without an environment."""
+    success: float = math.nan
+    """Share of successes among the episodes that ended in the rollout; nan if none did."""
+    episodes: int = 0  # number of episodes that ended in the rollout
+    unstable: int = 0  # number of episodes that ended because the simulation diverged
+    terms: dict[str, float] = field(default_factory=dict)  # mean of each reward term
+    policy_loss: float  # clipped policy loss
+    value_loss: float  # half the squared error, or `matching_loss` if the critic predicts symlogs
+    entropy: float  # entropy of a robot's actions, or mean of its joints' [nats]
+    kl: float = math.nan
+    """Divergence of the updated policy from the one that acted [nats] (Schulman 2020, k3)."""
+    clip_fraction: float = math.nan  # share of the probability ratios outside of the clip range
+    actor_gradient: float  # norm of the actor's gradient before clipping
+    critic_gradient: float  # norm of the critic's gradient before clipping
+    explained_variance: float
+    """Share of the returns' variance that the values before the update explain."""
+    learning_rate: float  # learning rate of the actor
+    collect_seconds: float = 0.0  # time to collect the rollout [s]
+    learn_seconds: float  # time to learn from it [s]
+    steps_per_second: float  # transitions per second, collection and learning together
+
+
 class Learner:
     """Networks, optimiser and rollout of a training run; call ``iterate`` until ``done``."""
 
@@ -200,7 +234,6 @@ class Learner:
         device: torch.device | str = "cpu",
         least_links: int = 0,
         tasks: Collection[str] = (),
-        processes: ProcessGroup = ALONE,
     ) -> None:
         """Build networks, optimiser and buffers, and begin episodes in the batch."""
         if batch.action_kind != policy.kind:
@@ -208,8 +241,7 @@ class Learner:
                 f"the policy's actions are {policy.kind}, the batch's {batch.action_kind}"
             )
         self.policy, self.config, self.device = policy, config, torch.device(device)
-        self.processes = processes
-        self.update, self.num_updates = 0, config.num_updates(batch.num_envs * processes.size)
+        self.update, self.num_updates = 0, config.num_updates(batch.num_envs)
         self.minibatch_size = config.minibatch_size(batch.num_envs)
         self.use(batch)
         tasks = {*tasks, *(spec.task for spec in batch.specs)}
@@ -220,9 +252,6 @@ class Learner:
         self._unneeded = entries_unneeded(policy, tasks)
 
         network_seed, *streams = np.random.SeedSequence(seed).generate_state(4).tolist()
-        if processes.rank:  # the same networks, but other actions and minibatches
-            own = np.random.SeedSequence(seed, spawn_key=(processes.rank,))
-            streams[:2] = own.generate_state(2).tolist()
         actor, critic = make_networks(policy, self.layout, network_seed)
         self.actor, self.critic = actor.to(self.device), critic.to(self.device)
         self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
@@ -283,7 +312,7 @@ class Learner:
             hint = "look at rewards and observations, or lower the learning rate"
             raise TaskError(f"update {self.update}: not finite: {', '.join(lost)}; {hint}")
         ended = time.perf_counter()
-        timesteps = self.config.num_steps * self.batch.num_envs * self.processes.size
+        timesteps = self.config.num_steps * self.batch.num_envs
         return UpdateMetrics(
             update=self.update,
             transitions=self.update * timesteps,
@@ -374,21 +403,20 @@ class Learner:
         return {n: torch.stack([step[n] for step in kept])[self.truncated] for n in kept[0]}
 
     def _rollout_metrics(self, terms: Mapping[str, torch.Tensor]) -> dict[str, Any]:
-        """Return the metrics of the rollout of all processes; terms are means, shape ()."""
+        """Return the metrics of the rollout; terms are means, shape ()."""
         ended = self.terminated | self.truncated
         env_scores, robots = self.scores.mean(dim=0), self.batch.env_robot_index
         robot_scores = torch.zeros(self.num_robots, device=env_scores.device)
         robot_scores.index_add_(0, robots, env_scores)
-        # Of several processes, one may have no environment of a robot.
         robot_envs = torch.bincount(robots, minlength=self.num_robots)
         counts = (self.successes & ended).sum(), ended.sum(), self.diverged.sum()
         means = torch.stack([*counts, self.rewards.mean(), env_scores.mean(), *terms.values()])
         # One copy from the device instead of one for each number.
         sums = torch.cat([means.double(), robot_scores.double(), robot_envs.double()])
-        sums = self.processes.sum(sums.to(self.device)).cpu()
-        of_rollout, scores, envs = torch.split(sums, [len(means), self.num_robots, self.num_robots])
+        sizes = [len(means), self.num_robots, self.num_robots]
+        of_rollout, scores, envs = torch.split(sums.cpu(), sizes)
         successes, episodes, unstable = of_rollout[:3].tolist()
-        reward, score, *term_means = (of_rollout[3:] / self.processes.size).tolist()
+        reward, score, *term_means = of_rollout[3:].tolist()
         return {
             "reward": reward,
             "score": score,
@@ -457,9 +485,6 @@ class Learner:
                 minibatch = {name: value[rows] for name, value in transitions.items()}
                 self.optimiser.zero_grad(set_to_none=True)
                 losses = self._add_gradients(obs, minibatch, self._robot_weights())
-                self.processes.average_gradients(
-                    chain(self.actor.parameters(), self.critic.parameters())
-                )
                 # Apart: a large gradient of the critic shall not shrink the actor's.
                 norms = [
                     nn.utils.clip_grad_norm_(network.parameters(), config.max_grad_norm)
@@ -472,7 +497,6 @@ class Learner:
         self._update_normalizers(observations)
         explained = explained_variance(values, returns)
         mean_metrics = torch.cat([torch.stack(metrics).mean(dim=0), explained[None]])
-        mean_metrics = self.processes.sum(mean_metrics) / self.processes.size
         means = dict(zip(LEARN_METRICS, mean_metrics.tolist(), strict=True))
         self.actor_lr_scale = next_actor_lr_scale(config, self.actor_lr_scale, means["kl"])
         return {**means, "learning_rate": actor_group["lr"]}
@@ -481,7 +505,7 @@ class Learner:
         """Include observations (m, ...) in the statistics, which all networks share."""
         if self.actor.normalizer is None:
             return
-        self.actor.normalizer.update(observations, self.processes)
+        self.actor.normalizer.update(observations)
         for network in (self.critic, self.target_critic):
             assert network.normalizer is not None
             network.normalizer.load_state_dict(self.actor.normalizer.state_dict())

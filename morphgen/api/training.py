@@ -62,7 +62,7 @@ class TrainingRun:
     config: RunConfig = field(repr=False)
     """All that determines the weights."""
     parts: tuple[Subrun, ...] = field(repr=False)
-    """The run, or a part for each robot; none in processes of ``torchrun`` but the first."""
+    """The run, or a part for each robot."""
 
     @property
     def checkpoints(self) -> tuple[Path, ...]:

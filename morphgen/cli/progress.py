@@ -19,7 +19,7 @@ from morphgen.tasks.registry import TASKS
 if TYPE_CHECKING:  # tqdm is loaded when a bar is drawn
     from tqdm import tqdm
 
-    from morphgen.rl.distributed import UpdateMetrics
+    from morphgen.rl.ppo import UpdateMetrics
     from morphgen.rl.runs.training import ShowMetrics, Subrun
 
     ShowUpdate = Callable[[UpdateMetrics, int, Mapping[str, str]], None]

@@ -81,7 +81,7 @@ def print_run(run: training.TrainingRun, minutes: int | None) -> None:
         parts = len(run.parts)
         what = f" with {run.unfinished} of {parts} robots left" * (parts > 1)
         note(f"stopped after {minutes} minutes{what}; it continues with --resume")
-    elif run.parts:  # the first process of torchrun alone says it
+    else:
         note(_next_command(run))
 
 

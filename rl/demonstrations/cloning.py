@@ -23,9 +23,9 @@ from morphgen.errors import TaskError
 from morphgen.rl.config import PPOConfig
 from morphgen.rl.demonstrations.lerobot import data_files
 from morphgen.rl.demonstrations.reader import Demonstrations
-from morphgen.rl.distributed import UpdateMetrics
 from morphgen.rl.ppo import (
     Learner,
+    UpdateMetrics,
     ema_update,
     explained_variance,
     half_square,

@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib import import_module
@@ -18,7 +18,6 @@ from types import ModuleType
 from typing import Any, Self
 
 import numpy as np
-import torch
 
 from morphgen.encoding.tokens import require_max_links
 from morphgen.errors import FormatError, MissingDependencyError, TaskError, nearest
@@ -27,11 +26,9 @@ from morphgen.formats.data_files import parse_json, read_text
 from morphgen.formats.files import locked_folder, naming
 from morphgen.formats.records import read_record
 from morphgen.processes import one_torch_thread
-from morphgen.progress import show_progress
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import PPOConfig, differences, policy_from
 from morphgen.rl.demonstrations.cloning import Cloner, DemonstrationBatches
-from morphgen.rl.distributed import ProcessGroup, UpdateMetrics, process_group
 from morphgen.rl.observation_layout import (
     Layout,
     last_link,
@@ -39,7 +36,7 @@ from morphgen.rl.observation_layout import (
     require_layout,
     with_fields,
 )
-from morphgen.rl.ppo import FINETUNING_ACTOR_LR_SCALE, Learner
+from morphgen.rl.ppo import FINETUNING_ACTOR_LR_SCALE, Learner, UpdateMetrics
 from morphgen.rl.runs.checkpoint import (
     CHECKPOINT,
     RunConfig,
@@ -83,15 +80,10 @@ def state_of(learner: Learner) -> dict[str, Any]:
     """
     states = {name: getattr(learner, name).state_dict() for name in (*NETWORKS, "optimiser")}
     states["batch"] = learner.batch.state_dict()
-    joined = learner.processes.joined
-    copied: dict[str, Any] = {name: in_main_memory(state) for name, state in states.items()}
     return {
-        **copied,
-        "generators": {n: joined(each.get_state()[None]) for n, each in learner.generators.items()},
-        "batch": {
-            name: joined(value) if isinstance(value, torch.Tensor) else value
-            for name, value in copied["batch"].items()
-        },
+        **{name: in_main_memory(state) for name, state in states.items()},
+        # The first axis is that of processes, of which runs had several.
+        "generators": {name: each.get_state()[None] for name, each in learner.generators.items()},
         "actor_lr_scale": learner.actor_lr_scale,
         "update": learner.update,
         "updates": learner.num_updates,
@@ -112,21 +104,17 @@ def resume_learner(learner: Learner, state: Mapping[str, Any]) -> None:
         **asdict(learner.config),
         "updates": learner.num_updates,
         "device": learner.device.type,
-        "processes": learner.processes.size,
+        "processes": 1,
     }
     processes = len(state["generators"]["actions"])
     stored = {**asdict(PPOConfig(**state["config"])), "processes": processes}
     _require_same(stored | {name: state[name] for name in ("updates", "device")}, ours)
-    n, rank, batch = learner.batch.num_envs, learner.processes.rank, state["batch"]
-    if processes > 1:  # a checkpoint has the environments of all processes, one after another
-        own = slice(rank * n, (rank + 1) * n)
-        batch = {k: v[own] if isinstance(v, torch.Tensor) else v for k, v in batch.items()}
-    learner.batch.load_state_dict(batch)
+    learner.batch.load_state_dict(state["batch"])
     for name in NETWORKS:
         getattr(learner, name).load_state_dict(state[name])
     learner.optimiser.load_state_dict(state["optimiser"])
     for name, generator in learner.generators.items():
-        generator.set_state(state["generators"][name][rank].cpu())
+        generator.set_state(state["generators"][name][0].cpu())
     learner.update, learner.actor_lr_scale = state["update"], state["actor_lr_scale"]
     learner.restart_episodes()
 
@@ -211,14 +199,11 @@ class TrainingBatches:
         self,
         config: RunConfig,
         *,
-        envs: range | None = None,
-        device: str | None = None,
         workers: int | None = None,
     ) -> None:
         """Build the robots and their goal sets."""
         self._config, self._workers = config, workers
-        self._envs = range(config.num_envs) if envs is None else envs
-        self._device = batch_device(config.sim, device or config.device)
+        self._device = batch_device(config.sim, config.device)
         goals = GoalConfig(tasks=config.tasks)
         self._batch: TaskBatch | None = None
         source = config.source
@@ -244,8 +229,7 @@ class TrainingBatches:
             seed = int(seeds.generate_state(1)[0])
         self._batch = batch_from_specs(
             [self._specs[i] for i in robots],
-            len(self._envs),
-            first=self._envs.start,
+            config.num_envs,
             sim=config.sim,
             seed=seed,
             kind=interface.kind,
@@ -402,8 +386,7 @@ def train(
 
     ``begin`` is called once, when only building robots and networks may still refuse the run.
 
-    Returns the parts, of which the last are unfinished or not begun after ``minutes``; none in
-    processes of ``torchrun`` other than the first, which alone writes files.
+    Returns the parts, of which the last are unfinished or not begun after ``minutes``.
     """
     execution, parts = execution or ExecutionConfig(), subruns_of(folder, config)
     for part in parts:
@@ -413,30 +396,29 @@ def train(
     if unfinished:  # a finished run is evaluated on machines without its GPU
         require_device(config.device)
     with _StopRequest(execution.minutes) as stop, ExitStack() as held, one_torch_thread():
-        processes, device = held.enter_context(process_group(config.device))
         holds = False
         for part in unfinished:
             if not holds:
                 require_links(config.source, config.max_links)
-                if begin is not None and processes.is_first:
+                if begin is not None:
                     begin()
-            envs = processes.share(part.config.num_envs, "--envs")
-            with nullcontext() if processes.is_first else show_progress(None):
-                batches = _batches(part.config, envs, device, execution.workers)
-            with _learner(part, batches, processes, device) as learner:
-                if processes.is_first:
-                    if not holds:
-                        folder.mkdir(parents=True, exist_ok=True)
-                        held.enter_context(hold(folder))
-                        open_run(folder, config, resume=resume)
-                    holds = True
-                    open_run(part.folder, part.config, resume=True)
-                    if batches.drawn and isinstance(config.source, GrammarSource):
-                        write_drawn(part.folder, config.source, batches.drawn)
-                writes = execution if processes.is_first else None
-                if _learn(learner, batches, part, writes, show, stop):
+            batches: TrainingBatches | DemonstrationBatches
+            if isinstance(config.source, RecordedSource):
+                batches = DemonstrationBatches(part.config)
+            else:
+                batches = TrainingBatches(part.config, workers=execution.workers)
+            with _learner(part, batches) as learner:
+                if not holds:
+                    folder.mkdir(parents=True, exist_ok=True)
+                    held.enter_context(hold(folder))
+                    open_run(folder, config, resume=resume)
+                holds = True
+                open_run(part.folder, part.config, resume=True)
+                if batches.drawn and isinstance(config.source, GrammarSource):
+                    write_drawn(part.folder, config.source, batches.drawn)
+                if _learn(learner, batches, part, execution, show, stop):
                     break
-    return parts if processes.is_first else []
+    return parts
 
 
 def require_runnable(config: RunConfig) -> None:
@@ -520,21 +502,8 @@ def updates_between(config: RunConfig) -> int:
     return max(min(-(-interval // num_steps), config.num_updates // MIN_CHECKPOINTS), 1)
 
 
-def _batches(
-    config: RunConfig, envs: range, device: str, workers: int | None
-) -> TrainingBatches | DemonstrationBatches:
-    if isinstance(config.source, RecordedSource):
-        return DemonstrationBatches(config)
-    return TrainingBatches(config, envs=envs, device=device, workers=workers)
-
-
 @contextmanager
-def _learner(
-    part: Subrun,
-    batches: TrainingBatches | DemonstrationBatches,
-    processes: ProcessGroup,
-    device: str,
-) -> Iterator[Learner]:
+def _learner(part: Subrun, batches: TrainingBatches | DemonstrationBatches) -> Iterator[Learner]:
     """Build the learner of a part, and resume its checkpoint if there is one."""
     config, state = part.config, None
     if (part.folder / CHECKPOINT).is_file():
@@ -548,10 +517,9 @@ def _learner(
             config.policy,
             config.ppo,
             seed=config.seed,
-            device=device,
+            device=config.device,
             least_links=batches.most_links,
             tasks=batches.tasks,
-            processes=processes,
         )
         if state:
             resume_learner(learner, state)
@@ -565,25 +533,18 @@ def _learn(
     learner: Learner,
     batches: TrainingBatches | DemonstrationBatches,
     part: Subrun,
-    execution: ExecutionConfig | None,
+    execution: ExecutionConfig,
     show: Callable[[Subrun], ShowMetrics] | None,
     stop: _StopRequest,
 ) -> bool:
-    """Make the remaining updates of a part; return whether it stopped early.
-
-    Without an execution, in processes besides the first, nothing is recorded, written or shown.
-    """
+    """Make the remaining updates of a part; return whether it stopped early."""
     is_stopped = False
     interval = updates_between(part.config)
-    report: ShowMetrics = lambda metrics, updates: None  # noqa: E731
-    recorders: AbstractContextManager[Recorder] = nullcontext(lambda metrics: None)
-    if execution is not None:
-        report = show(part) if show else report
-        tensorboard, wandb = execution.tensorboard, execution.wandb
-        recorders = recording(
-            part.folder, part.config, learner.update, tensorboard=tensorboard, wandb=wandb
-        )
-    with recorders as record:
+    report = show(part) if show else None
+    tensorboard, wandb = execution.tensorboard, execution.wandb
+    with recording(
+        part.folder, part.config, learner.update, tensorboard=tensorboard, wandb=wandb
+    ) as record:
         stop.start_clock()
         while not learner.done and not is_stopped:
             metrics = learner.iterate()
@@ -594,15 +555,14 @@ def _learn(
                 use_batch(learner, batches.make(learner.update))
             # A checkpoint has the state of the batch that the run continues with.
             left = learner.num_updates - learner.update
-            is_stopped = any(learner.processes.gather(stop.is_requested)) and left > 0
+            is_stopped = stop.is_requested and left > 0
             is_due = learner.update % interval == 0 and left >= interval
             if not left or is_due or is_stopped:
-                state = state_of(learner)  # of all processes
-                if execution is not None:
-                    write_checkpoint(part.folder, part.config, state)
+                write_checkpoint(part.folder, part.config, state_of(learner))
                 # A resumed run begins new episodes here, and must end with the same weights.
                 learner.restart_episodes()
-            report(metrics, learner.num_updates)
+            if report:
+                report(metrics, learner.num_updates)
     return is_stopped
 
 

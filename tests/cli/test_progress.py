@@ -12,7 +12,7 @@ from helpers.runs import small_config
 from morphgen.cli import progress
 from morphgen.cli.progress import training_progress
 from morphgen.progress import interrupts, part_of, report, stage
-from morphgen.rl.distributed import UpdateMetrics
+from morphgen.rl.ppo import UpdateMetrics
 
 FLOATS = [each.name for each in fields(UpdateMetrics) if each.type == "float"]
 REPORT = UpdateMetrics(

@@ -21,7 +21,6 @@ from morphgen.rl import ppo
 from morphgen.rl import scores as scoring
 from morphgen.rl.baselines.simple import Zero
 from morphgen.rl.config import PolicyConfig, PPOConfig
-from morphgen.rl.distributed import ProcessGroup
 from morphgen.rl.inference import make_env_and_controller, play, read_controller, run_episodes
 from morphgen.rl.ppo import Learner, gae, matching_loss, symexp, symlog
 from morphgen.rl.scores import iqm_interval, stratified_mean_interval, success_interval
@@ -82,18 +81,9 @@ def test_explained_variance_by_hand(factor, explained):
     assert ppo.explained_variance(returns, torch.ones(2, 2)) == 0
 
 
-class Twins(ProcessGroup):
-    """Two processes with the same values."""
-
-    def sum(self, values):
-        return 2 * values
-
-
-@pytest.mark.parametrize(("processes", "count"), [(ProcessGroup(), 1), (Twins(0, 2), 2)])
-def test_the_metrics_of_a_rollout_by_hand(processes, count):
+def test_the_metrics_of_a_rollout_by_hand():
     true, false = True, False
     trainer = learner(OnALine(3), num_steps=2, minibatches=1)
-    trainer.processes = processes
     trainer.batch.env_robot_index = torch.tensor([1, 0, 1])
     trainer.use(trainer.batch)
     trainer.rewards[:] = torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
@@ -107,8 +97,8 @@ def test_the_metrics_of_a_rollout_by_hand(processes, count):
     assert metrics["terms"] == {"one": 0.25, "success": 7.0}
     assert (metrics["reward"], metrics["score"]) == (3.5, 2.0)
     assert metrics["scores"] == (2.0, 2.0)
-    assert (metrics["success"], metrics["episodes"]) == (0.5, 4 * count)
-    assert metrics["unstable"] == count
+    assert (metrics["success"], metrics["episodes"]) == (0.5, 4)
+    assert metrics["unstable"] == 1
     trainer.terminated[:] = trainer.truncated[:] = False
     trainer.batch.env_robot_index = torch.tensor([1, 1, 1])
     metrics = trainer._rollout_metrics(terms)

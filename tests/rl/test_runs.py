@@ -16,8 +16,8 @@ from helpers.commands import tree
 from helpers.learners import learner
 from helpers.runs import EVAL, PPO, small_config, small_source
 from morphgen.errors import FormatError, MissingDependencyError, TaskError
-from morphgen.rl.distributed import UpdateMetrics
 from morphgen.rl.evaluation import eval_config_of, evaluate_baseline
+from morphgen.rl.ppo import UpdateMetrics
 from morphgen.rl.runs import checkpoint
 from morphgen.rl.runs.checkpoint import CHECKPOINT, CONFIG, config_from, open_run, read_checkpoint
 from morphgen.rl.runs.robot_source import drawn_source, other_side, robot_source, source_from
