@@ -221,7 +221,7 @@ def _ten_arms_rows(envs: int) -> list[Row]:
 def _ten_arms(envs: int, seconds: float, sim: str, contacts: Contacts | None = None) -> float:
     split = read_split(TEN_ARMS)
     with closing(make_split_batch(split, "train", envs, sim=sim, contacts=contacts)) as batch:
-        return measure_speed(batch, seconds, clock=time.process_time).steps_per_second
+        return measure_speed(batch, seconds, clock=time.process_time)
 
 
 def _ours(
@@ -235,7 +235,7 @@ def _ours(
 ) -> float:
     batch = make_batch(task, [robot], envs, sim=sim, workers=workers, contacts=contacts)
     with closing(batch):
-        return measure_speed(batch, seconds).steps_per_second
+        return measure_speed(batch, seconds)
 
 
 def _hasty(rate: Rate, seconds: float) -> float:

@@ -8,9 +8,6 @@ import math
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
-from importlib import import_module
-
-from tabulate import tabulate
 
 from morphgen.api import evaluation
 from morphgen.api.training import with_goal
@@ -27,7 +24,7 @@ from morphgen.tasks.reach import GOAL_KINDS
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.render.renderer import require_video_path
 from morphgen.tasks.scenes.make import make_batch
-from morphgen.tasks.sim.base import CONTROL_PERIOD
+from morphgen.tasks.sim.base import CONTROL_PERIOD, SUBSTEPS
 from morphgen.tasks.speed import measure_speed
 
 
@@ -81,23 +78,17 @@ def speed(args: argparse.Namespace) -> None:
             library=args.library,
         )
     with closing(batch), status(args, "measuring"):
-        step = SIMULATORS[sim].native_step
-        # Other processes would not be timed.
-        native_steps = [(import_module(step[0]), step[1])] if step and workers == 1 else []
-        result = measure_speed(batch, args.seconds, own=native_steps)
+        steps_per_second = measure_speed(batch, args.seconds)
 
     def text() -> str:
-        shares = [(part, f"{share:.1%}") for part, share in result.shares.items()]
         return (
             f"{args.task}, {batch.specs[0].robot.name}, {args.envs} environments, {sim}, "
             f"{batch.device.type}, {workers} worker(s)\n"
-            f"environment steps per second: {result.steps_per_second:,.0f}\n"
-            f"physics steps per second:     {result.substeps_per_second:,.0f}\n"
-            f"{tabulate(shares)}"
+            f"environment steps per second: {steps_per_second:,.0f}\n"
+            f"physics steps per second:     {SUBSTEPS * steps_per_second:,.0f}"
         )
 
-    data = {"steps_per_second": result.steps_per_second, "shares": result.shares}
-    opt.print_result(args, data, text)
+    opt.print_result(args, {"steps_per_second": steps_per_second}, text)
 
 
 FILM_EPISODES = 3  # number of episodes in a video

@@ -341,8 +341,6 @@ class Simulator:
 
     Its arguments are the scenes, the contacts, the number of workers and the device of the tensors.
     It raises a SimulationError if the simulator cannot hold a scene."""
-    native_step: tuple[str, str] | None
-    """Module and function of the library's own step, which ``speed`` measures; None without one."""
     max_envs: int
     """Largest number of environments to hold at once, where work can be divided."""
     devices: tuple[str, ...] = ("cpu",)

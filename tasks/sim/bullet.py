@@ -173,6 +173,5 @@ def divide(scenes: Sequence[Scene], processes: int) -> list[list[int]]:
 SIMULATOR = Simulator(
     "pybullet",
     lambda scenes, contacts, workers, _: BulletSimulation(scenes, contacts, processes=workers),
-    native_step=("pybullet", "stepSimulation"),
     max_envs=128,  # an environment takes 36 MB
 )

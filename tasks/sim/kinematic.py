@@ -130,7 +130,6 @@ def _joint_table(robots: Sequence[Robot]) -> Array:
 SIMULATOR = Simulator(
     "kinematic",
     lambda scenes, contacts, _, device: KinematicSimulation(scenes, contacts, device=device),
-    native_step=None,
     max_envs=65_536,
     devices=("cpu", "cuda"),
     simulates_contacts=False,

@@ -347,7 +347,6 @@ def _drain(work: Iterator[Work], refused: dict[int, str]) -> None:
 SIMULATOR = Simulator(
     "mujoco",
     lambda scenes, contacts, workers, _: MujocoSimulation(scenes, contacts, threads=workers),
-    native_step=("mujoco", "mj_step"),
     max_envs=1024,
     worker_envs=8,
 )

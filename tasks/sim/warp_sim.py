@@ -605,7 +605,6 @@ def kernels_stored(arch: int) -> bool:
 SIMULATOR = Simulator(
     "warp",
     lambda scenes, contacts, _, device: WarpSimulation(scenes, contacts, device=device),
-    native_step=None,
     max_envs=65_536,
     devices=("cuda",),  # tests use the CPU, where MuJoCo is far faster
     takes_workers=False,
