@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, fields, is_dataclass, replace
+from dataclasses import replace
 from functools import partial
 from inspect import signature
-from os import PathLike
 from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -21,7 +19,6 @@ from numpy.typing import NDArray
 from morphgen.arguments import whole_number
 from morphgen.errors import TaskError, nearest
 from morphgen.grammar.robot_source import RobotLike
-from morphgen.model.robot import Robot
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.observation import Observation, ObservationConfig
@@ -122,33 +119,6 @@ def task_config(task: str, **constants: Any) -> TaskConfig:  # noqa: ANN401 - of
     return task_configs({task: constants})[0]
 
 
-class TextSpec(EnvSpec):
-    """Specification whose arguments may be robots and configs, which ``to_json`` writes as text."""
-
-    def to_json(self) -> str:
-        """Return the specification as JSON.
-
-        A robot that is no text is named only: ``gym.make`` of the JSON refuses it.
-        """
-        kwargs = {name: _plain(value) for name, value in self.kwargs.items()}
-        return EnvSpec.to_json(replace(self, kwargs=kwargs))
-
-
-def _plain(value: Any) -> Any:  # noqa: ANN401 - any argument of an environment
-    """Return an argument of an environment as JSON data."""
-    if isinstance(value, Robot):
-        return f"<Robot {value.name!r}>"
-    if isinstance(value, Mapping):
-        return {name: _plain(each) for name, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    if is_dataclass(value) and not isinstance(value, type):
-        return asdict(value)
-    if isinstance(value, AutoresetMode):
-        return value.value
-    return str(value) if isinstance(value, PathLike) else value
-
-
 class BatchEnv:
     """Pictures, specification and copies of a Gymnasium environment, single or a vector.
 
@@ -171,20 +141,7 @@ class BatchEnv:
         self._size, self.render_mode = render_arguments(render_mode, size), render_mode
         self._renderers: dict[int, Renderer] = {}
         self._final_states: dict[int, RenderState] = {}
-        self._spec: EnvSpec | None = None
         self._running = False
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """Specification of ``gym.make``, with ``max_episode_steps``; None without it."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        if spec is not None:
-            values = {each.name: getattr(spec, each.name) for each in fields(spec) if each.init}
-            limit = spec.max_episode_steps or self.max_episode_steps
-            self._spec = TextSpec(**values | {"max_episode_steps": limit})
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy, which makes renderers anew."""
