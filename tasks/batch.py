@@ -160,18 +160,8 @@ class TaskBatch:
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a copy, which goes on as this batch does.
-
-        Raises:
-            TaskError: If the simulator holds its state where it cannot be copied.
-        """
-        kind = type(self.simulation)
-        if kind.__getstate__ is object.__getstate__:
-            raise TaskError(
-                f"a {kind.__name__} cannot be copied: make another environment, or use the "
-                "simulator 'mujoco'"
-            )
-        return vars(self)
+        """Refuse to be copied: a copy of a simulator's memory would stand still."""
+        raise TaskError("environments cannot be copied: make another one")
 
     @property
     def num_envs(self) -> int:

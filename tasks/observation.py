@@ -321,10 +321,6 @@ class EpisodeLayouts:
             self._spaces[robot].place_obstacles([obstacle.pose for obstacle in obstacles])
         return self._spaces[robot]
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a copy, which compiles the scenes again."""
-        return vars(self) | {"_spaces": {}}
-
     def _place(self) -> None:
         """Put the obstacles where the current layouts have them."""
         self.poses.copy_(self._layout_poses[self._index, self.current.clamp(min=0)])  # -1: zeros

@@ -188,9 +188,6 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
     ``observation``, a vector of all other entries in the order of their names, as hindsight replay
     needs them. The reward is then ``compute_reward``: the terms that depend on the goal alone.
 
-    A copy (``copy.deepcopy``, ``pickle``) goes on exactly as the original would; with simulators
-    that hold their state elsewhere, such as PyBullet, it is refused.
-
     A task whose ``TaskEnvs`` has ``formulas``, as all of morphgen's have, steps in NumPy on the CPU
     (``NumpyStepper``), several times as fast as the batch; all results equal the batch's to the
     rounding of single precision. Others, and goals that are poses, step the batch in torch.
@@ -276,7 +273,8 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         self.action_joints = tuple(robot_links[link - 1].name for link in self.action_links)
         self._was_reset = self._next_has_begun = False
         self._final_physics: tuple[torch.Tensor, torch.Tensor] | None = None
-        self._stepper = self._make_stepper()
+        is_numpy = steps_in_numpy(batch)
+        self._stepper = NumpyStepper(batch, self._without_padding) if is_numpy else None
         first = self._in_goal_form(self._without_padding(self.batch.observe()))
         self.observation_space = cast(
             "gym.Space[NumpyObservation]",
@@ -338,17 +336,6 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         rewards = TASKS[self.task].goal_reward(self.env_spec.config, *rows)
         return rewards.numpy().reshape(achieved.shape[:-1])
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a copy, which makes stepper and renderer anew."""
-        return super().__getstate__() | {"_stepper": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a copy: views of tensors must be of its own tensors."""
-        vars(self).update(state)
-        self._stepper = self._make_stepper()
-        if self._stepper is not None and self._was_reset:
-            self._stepper.begin(self._without_padding(self.batch.observe()))
-
     def render(self) -> Frame | None:
         """Return a picture, shape (height, width, 3), if ``render_mode`` is ``rgb_array``."""
         frames = self._frames()
@@ -358,11 +345,6 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         """Free everything; a second call does nothing."""
         self.closed = True
         self._free()
-
-    def _make_stepper(self) -> NumpyStepper | None:
-        if not steps_in_numpy(self.batch):
-            return None
-        return NumpyStepper(self.batch, self._without_padding)
 
     def _torch_step(self, action: NDArray[Any]) -> EnvStep:
         """Step the batch, which begins the next episode where one ends."""

@@ -120,7 +120,7 @@ def task_config(task: str, **constants: Any) -> TaskConfig:  # noqa: ANN401 - of
 
 
 class BatchEnv:
-    """Pictures, specification and copies of a Gymnasium environment, single or a vector.
+    """Pictures of a Gymnasium environment, single or a vector.
 
     Attributes:
         batch: The batch, which it owns.
@@ -142,11 +142,6 @@ class BatchEnv:
         self._renderers: dict[int, Renderer] = {}
         self._final_states: dict[int, RenderState] = {}
         self._running = False
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a copy, which makes renderers anew."""
-        self._require_open()
-        return vars(self) | {"_renderers": {}}
 
     def _require_open(self) -> None:
         if self.closed:

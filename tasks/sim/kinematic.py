@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -104,10 +103,6 @@ class KinematicSimulation(Simulation):
         """Return why environments diverged in the last step; see ``Simulation.faults``."""
         envs = torch.nonzero(self._diverged)[:, 0].tolist()
         return {env: f"{self._label(env)}: a target or position is not finite" for env in envs}
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a copy: nothing of it is elsewhere."""
-        return vars(self)
 
 
 def _joint_table(robots: Sequence[Robot]) -> Array:

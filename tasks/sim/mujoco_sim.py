@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import pairwise
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -212,13 +211,6 @@ Work = tuple[int, mujoco.MjModel, mujoco.MjData, Array, Array, Array, Array]
 and of its applied forces in the data and in ``PositionControl``."""
 
 
-_VIEWS = {
-    *("_state", "q", "qd", "object_pose", "object_velocity"),
-    *("_control", "_work", "_seen", "_warnings", "_pool"),
-}
-"""Attributes that ``_view_data`` makes."""
-
-
 class MujocoSimulation(HostSimulation):
     """Environments in MuJoCo, on the CPU; a ``Simulation``.
 
@@ -242,11 +234,6 @@ class MujocoSimulation(HostSimulation):
         self._data = [mujoco.MjData(world.model) for world in self._worlds]
         self._controls = np.zeros(self._targets.shape)
         self._helpers = threads - 1
-        self._view_data()
-        self._go_home()
-
-    def _view_data(self) -> None:
-        """Make everything that has views of the data, and the threads."""
         self._state = MujocoState(self._worlds, self._data)
         self.q, self.qd = self._state.q, self._state.qd
         self.object_pose = self._state.object_pose
@@ -260,17 +247,7 @@ class MujocoSimulation(HostSimulation):
             )
         self._seen, self._warnings = None, MujocoWarnings()
         self._pool = ThreadPoolExecutor(self._helpers, "mujoco") if self._helpers else None
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a copy, which goes on as this simulation does."""
-        self._require_open()
-        return {name: value for name, value in vars(self).items() if name not in _VIEWS}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a copy: views of the data must be of its own data."""
-        vars(self).update(state)
-        self._view_data()
-        self._state.read()
+        self._go_home()
 
     def close(self) -> None:
         """Free everything; a second call does nothing."""
