@@ -2,37 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
-from functools import wraps
 from numbers import Integral
 from os import PathLike
 from pathlib import Path
 from types import SimpleNamespace
-from typing import ParamSpec, TypeVar
 
-from morphgen.errors import MorphgenError, SignatureError
-
-P = ParamSpec("P")
-R = TypeVar("R")
-
-
-def checked_signature(function: Callable[P, R]) -> Callable[P, R]:
-    """Return a public function whose errors about its arguments name those that it has."""
-    signature = inspect.signature(function)
-    parameters = [each.replace(annotation=each.empty) for each in signature.parameters.values()]
-    shown = signature.replace(parameters=parameters, return_annotation=signature.empty)
-
-    @wraps(function)
-    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
-        try:
-            signature.bind(*args, **kwargs)
-        except TypeError as error:
-            name = function.__qualname__
-            raise SignatureError(f"{name}: {error}; expected {name}{shown}") from None
-        return function(*args, **kwargs)
-
-    return checked
+from morphgen.errors import MorphgenError
 
 
 def path_argument(name: str, value: object, error: type[MorphgenError]) -> Path:

@@ -31,10 +31,6 @@ class MorphgenError(Exception):
     """Base of all errors that a user can cause; its text is one line for the terminal."""
 
 
-class SignatureError(MorphgenError, TypeError):
-    """A public function was called with arguments that it does not have."""
-
-
 class RobotError(MorphgenError):
     """The structure of a robot is inconsistent."""
 

@@ -2,7 +2,6 @@
 
 import ast
 import doctest
-import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -268,11 +267,8 @@ play("push", "prims", policy="ik") => valid: scripted, zero, random
 play("reach", "prims", kind="binary") => binary
 goals("arm=ur5 ee=stick") => name one split, or say --task for a robot
 goals("interpolation/arm3/reach", obstacles=True) => obstacles: only with task
-compose("ur5", "plane") => expected compose(request='', *, name=None, geom
 compose(arm=None) => arm None: expected a text or a number
-write("prims") => write: missing a required argument: 'folder'; expec
 write("prims", 5) => folder 5: expected a path
-read("x", rot="y") => read: got an unexpected keyword argument 'rot'; ex
 """
 """Calls of public functions that are refused, and part of the reason."""
 
@@ -317,14 +313,3 @@ def test_values_that_are_no_texts_give_one_clear_error(call):
         with pytest.raises(MorphgenError) as caught:
             call(value)
         assert len(str(caught.value).splitlines()) == 1
-
-
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_arguments_that_a_function_lacks_are_named_with_those_that_it_has(name):
-    function = getattr(morphgen, name)
-    says = rf"^{name}: too many positional .*; expected {name}\("
-    for arguments in (range(9), ("ur5", "plane", "robots", "more", "and", "more")):
-        with pytest.raises(MorphgenError, match=says) as caught:
-            function(*arguments)
-        assert isinstance(caught.value, TypeError)
-    assert pickle.loads(pickle.dumps(function)) is function

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from morphgen.arguments import checked_signature, text_argument
+from morphgen.arguments import text_argument
 from morphgen.encoding import tokens as encoding
 from morphgen.encoding.similarity import MEASURES, features, get_measure, similarity_matrix
 from morphgen.encoding.tokens import default_max_links
@@ -19,7 +19,6 @@ from morphgen.grammar.robot_source import RobotLike, resolve_robot, robot_list
 from morphgen.typing import Array
 
 
-@checked_signature
 @explain_missing_extras()
 def tokens(
     robot: RobotLike,
@@ -63,7 +62,6 @@ def tokens(
     return encoding.tokens(loaded, token_shapes(loaded, parts.folders), q, max_links=size)
 
 
-@checked_signature
 @explain_missing_extras()
 def similarity(
     robots: Iterable[RobotLike],

@@ -7,7 +7,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from morphgen import checks
-from morphgen.arguments import checked_signature
 from morphgen.checks.conformance import ConformanceReport, compare, compare_file
 from morphgen.checks.hold import hold_files
 from morphgen.checks.rules import home_penetrations
@@ -27,7 +26,6 @@ from morphgen.model.findings import Finding
 from morphgen.model.robot import Robot
 
 
-@checked_signature
 def check(
     robot: RobotLike, *, tool_required: bool = True, library: LibraryFolders = ()
 ) -> tuple[Finding, ...]:
@@ -55,7 +53,6 @@ def check(
     return check_source(find_robot(robot), default_library(library), tool_required=tool_required)
 
 
-@checked_signature
 def fix(robot: RobotLike, *, library: LibraryFolders = ()) -> tuple[Robot, tuple[Finding, ...]]:
     """Apply all safe repairs to a robot.
 
@@ -102,7 +99,6 @@ def bundle_of(source: RobotReference) -> Path | None:
     return folder if (folder / CARD).is_file() else None
 
 
-@checked_signature
 def conform(
     robot: RobotLike, *, samples: int = 100, seed: int = 0, library: LibraryFolders = ()
 ) -> ConformanceReport:

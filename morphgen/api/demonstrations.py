@@ -16,7 +16,7 @@ from morphgen.api.training import (
     train_run,
     with_goal,
 )
-from morphgen.arguments import checked_signature, path_argument, require_types, whole_number
+from morphgen.arguments import path_argument, require_types, whole_number
 from morphgen.benchmark.demonstrations import Verification, changed_files, describe
 from morphgen.encoding.tokens import default_max_links
 from morphgen.errors import MorphgenError, TaskError
@@ -43,7 +43,6 @@ from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig
 
 
-@checked_signature
 def record(
     robots: str | PathLike[str] | None = None,
     *,
@@ -173,7 +172,6 @@ def _sources(given: SimpleNamespace) -> tuple[Source, ...]:
     return tuple(named_source(each) for each in words)
 
 
-@checked_signature
 def demos(path: str | PathLike[str]) -> Demonstrations:
     """Read demonstrations as a ``Dataset`` of torch, whose items are steps.
 
@@ -193,7 +191,6 @@ def demos(path: str | PathLike[str]) -> Demonstrations:
     return Demonstrations(path_argument("path", path, TaskError))
 
 
-@checked_signature
 def verify(path: str | PathLike[str], *, episodes: int = 10, seed: int = 0) -> Verification:
     """Simulate random episodes of demonstrations again, and compare each step and all files.
 
@@ -220,7 +217,6 @@ def verify(path: str | PathLike[str], *, episodes: int = 10, seed: int = 0) -> V
     return Verification(replays, changed_files(data.folder))
 
 
-@checked_signature
 def clone(
     demonstrations: str | PathLike[str] | Sequence[str | PathLike[str]],
     *,

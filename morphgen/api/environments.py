@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from os import PathLike
 from typing import TYPE_CHECKING, Any, TypedDict, overload
 
-from morphgen.arguments import checked_signature, text_argument
+from morphgen.arguments import text_argument
 from morphgen.errors import TaskError, nearest
 from morphgen.extras import explain_missing_extras
 from morphgen.grammar.library import LibraryFolders
@@ -72,7 +72,6 @@ def make_env(
     num_envs: int,
     **options: Unpack[VectorOptions],
 ) -> TaskVector: ...
-@checked_signature
 @explain_missing_extras()
 def make_env(
     task: str,

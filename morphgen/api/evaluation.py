@@ -13,7 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from morphgen.api.training import named_source, with_goal
-from morphgen.arguments import checked_signature, path_argument, require_types, text_argument
+from morphgen.arguments import path_argument, require_types, text_argument
 from morphgen.benchmark.release import is_release, read_release
 from morphgen.benchmark.scores.submission import (
     EvalProtocol,
@@ -61,7 +61,6 @@ from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
 from morphgen.tasks.task import TaskConfig
 
 
-@checked_signature
 def evaluate(
     policy: str | PathLike[str],
     robots: str | PathLike[str] | None = None,
@@ -143,7 +142,6 @@ def evaluate(
     return Evaluation(scores)
 
 
-@checked_signature
 def play(
     task: str,
     robot: RobotLike,

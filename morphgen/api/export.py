@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 
 from morphgen.api.checks import bundle_of
-from morphgen.arguments import checked_signature, path_argument, require_types, text_argument
+from morphgen.arguments import path_argument, require_types, text_argument
 from morphgen.checks.robot_srdf import (
     MATRIX_SAMPLES,
     collision_matrix,
@@ -47,7 +47,6 @@ from morphgen.grammar.robot_source import RobotLike, RobotReference, find_robot,
 from morphgen.model.robot import Robot
 
 
-@checked_signature
 @explain_missing_extras()
 def export(
     robot: RobotLike,

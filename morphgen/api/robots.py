@@ -8,7 +8,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from morphgen.arguments import checked_signature, path_argument, text_argument, truth, whole_number
+from morphgen.arguments import path_argument, text_argument, truth, whole_number
 from morphgen.checks import check
 from morphgen.errors import CompositionError, FormatError, GrammarError, nearest
 from morphgen.extras import explain_missing_extras
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from morphgen.fitting.fitted_robot import FittedRobot
 
 
-@checked_signature
 @explain_missing_extras()
 def compose(
     request: str = "",
@@ -80,7 +79,6 @@ def compose(
     return with_geometry(robot, geometry, parts.folders)
 
 
-@checked_signature
 def sample(
     grammar: str | PathLike[str],
     n: int,
@@ -120,7 +118,6 @@ def sample(
     return (sample.robot for sample in samples)
 
 
-@checked_signature
 def read(
     path: str | PathLike[str],
     *,
@@ -149,7 +146,6 @@ def read(
     return read_robot(source, root=folder, skip_missing_meshes=skip_missing_meshes)
 
 
-@checked_signature
 def write(
     robot: RobotLike,
     folder: str | PathLike[str],
@@ -184,7 +180,6 @@ def write(
     return write_bundle(robot, target, check(robot), picture=picture)
 
 
-@checked_signature
 @explain_missing_extras()
 def fit(
     robot: RobotLike,

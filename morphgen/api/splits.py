@@ -11,7 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, overload
 
-from morphgen.arguments import checked_signature, path_argument, text_argument, truth, whole_number
+from morphgen.arguments import path_argument, text_argument, truth, whole_number
 from morphgen.benchmark.audit import Audit, audit
 from morphgen.benchmark.generate import (
     SplitRequest,
@@ -264,7 +264,6 @@ def split(
     library: LibraryFolders = ...,
     **choice: Unpack[NewSplit],
 ) -> tuple[LoadedSplit, ...]: ...
-@checked_signature
 @explain_missing_extras()
 def split(
     name: str | PathLike[str] = "",
@@ -520,7 +519,6 @@ def _row(result: GoalResult) -> tuple[str, ...]:
     return (result.robot, result.side or "", result.task, count, rate, boxes, certified)
 
 
-@checked_signature
 def goals(
     robots: str | PathLike[str] | Robot,
     *,

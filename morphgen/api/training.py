@@ -11,7 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from morphgen.arguments import checked_signature, require_types
+from morphgen.arguments import require_types
 from morphgen.benchmark.split_folder import read_split_or_folder
 from morphgen.encoding.tokens import default_max_links, require_max_links
 from morphgen.errors import BenchmarkError, TaskError
@@ -80,7 +80,6 @@ class TrainingRun:
         return "\n".join(map(str, self.checkpoints))
 
 
-@checked_signature
 def train(
     robots: str | PathLike[str],
     *,
