@@ -180,7 +180,7 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
     ``info`` has ``success``, which is also ``is_success``, ``distance``, ``score``, ``diverged``,
     ``terms``, for goals that are poses ``angle`` (see ``Step``), and ``self_collision``: whether
     links collide with each other in this environment. Episodes end by themselves, after
-    ``max_episode_steps`` at the latest: no time limit wrapper is needed.
+    ``spec.max_episode_steps`` at the latest: no time limit wrapper is needed.
 
     ``reset(seed=s)`` begins the same episodes as environment 0 of ``make_batch(..., seed=s)``.
 

@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -141,7 +142,19 @@ class BatchEnv:
         self._size, self.render_mode = render_arguments(render_mode, size), render_mode
         self._renderers: dict[int, Renderer] = {}
         self._final_states: dict[int, RenderState] = {}
+        self._spec: EnvSpec | None = None
         self._running = False
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Specification of ``gym.make``, with ``max_episode_steps``; None without it."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None:
+            limit = spec.max_episode_steps or self.max_episode_steps
+            self._spec = replace(spec, max_episode_steps=limit)
 
     def _require_open(self) -> None:
         if self.closed:

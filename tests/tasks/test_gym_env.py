@@ -188,7 +188,7 @@ def rows_of_seed(env):
 def test_time_limit(name, config):
     given = {"config": config or CONFIGS[name]}
     with closing(make(name, **given)) as env:
-        assert env.unwrapped.max_episode_steps == STEPS
+        assert env.spec.max_episode_steps == env.unwrapped.spec.max_episode_steps == STEPS
     with closing(make(name, **given, max_episode_steps=3)) as env:
         assert env.spec.max_episode_steps == 3
         env.reset(seed=0)
@@ -200,7 +200,7 @@ def test_time_limit(name, config):
         with pytest.raises(TaskError, match=f"max_episode_steps {STEPS + 1}: episodes end after"):
             make_any(name, **given, max_episode_steps=STEPS + 1)
     with closing(make_vec(name, **given, max_episode_steps=2)) as envs:
-        assert envs.max_episode_steps == 2
+        assert (envs.max_episode_steps, envs.spec.max_episode_steps) == (2, 2)
         envs.reset(seed=0)
         zero = np.zeros(envs.action_space.shape, np.float32)
         assert not envs.step(zero)[3].any()
