@@ -297,7 +297,7 @@ def _policy_scores(given: SimpleNamespace) -> dict[str, list[Score]]:
     files = list(checkpoint_files(path))
     for file in files:
         run, learner = read_checkpoint(file)
-        if learner["update"] < run.num_updates:
+        if learner["update"] < run.num_updates and not is_named(name):
             note(
                 f"morphgen: {file} is not finished: update {learner['update']} of {run.num_updates}"
             )
