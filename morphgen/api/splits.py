@@ -218,7 +218,7 @@ class LoadedSplit:
             jobs: Number of processes.
 
         Returns:
-            Differences; none if all robots are the same here.
+            Differences; none if all robots are the same here, and goals are certified.
         """
         if self.folder is None:
             return compare_robots(self.definition, self.library, jobs=jobs)

@@ -23,6 +23,7 @@ import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -59,17 +60,22 @@ from morphgen.formats.files import locked_folder, replacing_folder, writing
 from morphgen.formats.records import Record, read_record
 from morphgen.formats.zip_files import ZipLimits, unpack_zip, write_zip
 from morphgen.grammar.library import Library
-from morphgen.splits.split import Split, split_id
+from morphgen.processes import parallel_map
+from morphgen.progress import stage
+from morphgen.splits.split import Member, Side, Split, sided_members, split_id
 from morphgen.splits.split_file import find_split, is_split_name, read_split_file
 from morphgen.tasks.goals.split_goals import (
     GOALS,
     GoalResult,
+    SplitGoals,
+    certify_goal_set,
     goal_files,
     has_goals,
+    read_split_goals,
     require_goal_sets,
     sample_split_goals,
 )
-from morphgen.tasks.scenes.env_specs import GoalConfig
+from morphgen.tasks.scenes.env_specs import GoalConfig, member_spec
 
 RELEASE_FILE = "release.json"
 SCORES_FILE = "scores.json"
@@ -467,6 +473,38 @@ def _without_sources(parts: Any) -> list[Any]:  # noqa: ANN401
     ]
 
 
+def _goal_differences(
+    folder: Path, split: Split, library: Library, *, jobs: int
+) -> Iterator[Difference]:
+    """Yield members whose goal sets are not those of their robots, or fail their certificates."""
+    try:
+        goals = read_split_goals(folder)
+    except MorphgenError as error:
+        yield Difference(GOALS, str(error))
+        return
+    members = sided_members(split)
+    with stage("certifying goals"):
+        faults = list(parallel_map(partial(_goal_fault, goals, library), members, jobs))
+    for (side, member), fault in zip(members, faults, strict=True):
+        if fault:
+            yield Difference(member.name, f"its goal set on side {side}: {fault}")
+
+
+def _goal_fault(goals: SplitGoals, library: Library, sided_member: tuple[Side, Member]) -> str:
+    """Return what is wrong with the goal set of a member, or nothing; runs in worker processes."""
+    side, member = sided_member
+    result = goals.sets.get((side, member.name))
+    if result is None or result.goals is None:
+        return "there is none"
+    if bool(result.goals.obstacles) != member.obstacles:
+        return f"it is for a robot {'with' if result.goals.obstacles else 'without'} obstacles"
+    try:
+        spec = member_spec(member, library, goals.config, shipped=result.goals)
+        return next(iter(certify_goal_set(result.goals, spec)), "")
+    except MorphgenError as error:
+        return str(error)
+
+
 @dataclass(frozen=True)
 class Verification:
     """Result of a verification."""
@@ -480,8 +518,8 @@ class Verification:
 def verify(name_or_path: str | Path, library: Library, *, jobs: int = 1) -> Verification:
     """Compare a split with the robots that its derivations give today, by its id and their hashes.
 
-    In a folder every file is compared with ``SHA256SUMS`` and with the robot of its derivation; in
-    a release also its description and its licences.
+    In a folder every file is compared with ``SHA256SUMS`` and with the robot of its derivation, and
+    every goal is certified; in a release also its description and its licences are compared.
     """
     folder = Path(name_or_path)
     if is_archive(folder):
@@ -501,6 +539,8 @@ def verify(name_or_path: str | Path, library: Library, *, jobs: int = 1) -> Veri
         differences += compare_robots(split, library, jobs=jobs)
         return Verification(split, computed_id, tuple(differences))
     differences += compare_folder(folder, split, library, jobs=jobs)
+    if has_goals(folder) and not differences:  # what is changed explains faults of goals
+        differences += _goal_differences(folder, split, library, jobs=jobs)
     if not is_release(folder):
         return Verification(split, computed_id, tuple(differences))
     differences += _release_differences(folder, split, library)

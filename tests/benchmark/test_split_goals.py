@@ -255,6 +255,42 @@ def test_checksums_of_a_build_cover_its_goals(home, cache):
     assert "is not what SHA256SUMS was written for" in why
 
 
+def with_a_raised_goal(sets):
+    """A reach goal that its configuration does not reach, under the key of the set."""
+    poses = sets[0].goals.poses.copy()
+    poses[3, 2] += 0.1
+    return replace(sets[0].goals, poses=poses)
+
+
+@pytest.mark.parametrize(
+    ("position", "forge", "message"),
+    [
+        (0, with_a_raised_goal, "goal 3: the tool of its configuration is 0.1 m away"),
+        (0, lambda sets: replace(sets[0].goals, key="0" * 64), "is of another robot, seed, ground"),
+        (1, lambda sets: replace(sets[1].goals, obstacles=()), "it is for a robot without obstacl"),
+        (2, lambda sets: sets[1].goals, "it is for a robot with obstacles"),
+        (2, lambda sets: sets[0].goals, "is not for task push"),
+    ],
+)
+def test_verify_certifies_goals_whose_checksums_are_right(home, cache, position, forge, message):
+    """A stranger's folder: all hashes are those of its files, but its goals are made up."""
+    sets = sample_sets(mixed(), cache)
+    sets[position] = replace(sets[position], goals=forge(sets))
+    if sets[position].task == "push" and hasattr(sets[position].goals, "poses"):
+        sets[position] = replace(sets[position], task="reach")  # which the file is read as
+    write_goals(home, sets, RECIPE)
+    (found,) = verify(home, LIBRARY).differences
+    assert found.where == sets[position].robot
+    assert found.why.startswith(f"its goal set on side {sets[position].side}: ")
+    assert message in found.why
+
+
+def test_verify_requires_a_goal_set_of_every_member(home, cache):
+    write_goals(home, sample_sets(mixed(), cache)[:2], RECIPE)
+    (found,) = verify(home, LIBRARY).differences
+    assert (found.where, found.why) == ("gantry-plane", "its goal set on side test: there is none")
+
+
 def test_interrupted_build_is_not_marked_finished(home, cache, monkeypatch):
     member_sets = sample_sets(mixed(), cache)
 
