@@ -452,11 +452,10 @@ def test_robots_above_the_default_max_links_can_be_measured(ok):
 @pytest.mark.parametrize("name", POLICIES.builtin)
 def test_shipped_policies_are_small_and_act_on_any_robot(name):
     policy = POLICIES[name]
-    run_config, learner = read_checkpoint(policy.file)
+    run_config, _ = read_checkpoint(policy.file)
     assert policy.file.stat().st_size < 2e6
     assert run_config.interface.max_links is None
     assert run_config.source.grammars, "it was trained on drawn robots alone"
-    assert learner["update"] == run_config.num_updates
     for task in ("reach", "push"):
         assert (name in policies_for(task)) == (task in policy.tasks)
         assert (task in policy.tasks) == (task == run_config.source.task)
