@@ -17,7 +17,7 @@ from morphgen.encoding.similarity import is_near
 from morphgen.encoding.tokens import MAX_LINKS, require_max_links
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.derivation import Derivation
-from morphgen.grammar.derive import RandomChooser, RecordedChooser, TooManyPartsError, derive
+from morphgen.grammar.derive import RandomChooser, TooManyPartsError, derive
 from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
 from morphgen.processes import parallel_map
@@ -99,7 +99,7 @@ class RobotStream:
         """Return the first derivation drawn, which conditions may reject; None if too large."""
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
         try:
-            return derive(self.grammar, library, RecordedChooser(RandomChooser(rng)))
+            return derive(self.grammar, library, RandomChooser(rng))
         except TooManyPartsError:
             return None
 

@@ -39,45 +39,31 @@ class Chooser:
 
 
 class RandomChooser(Chooser):
-    """Draws every choice from a random generator."""
+    """Draws every choice from a random generator.
+
+    Attributes:
+        choices: All choices made so far, as a file would hold them.
+    """
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
+        self.choices: dict[str, float] = {}
 
     def alternative(self, key: str, weights: list[float]) -> int:
         """Draw an index with probabilities proportional to the weights."""
         total = np.cumsum(weights)
         index = int(np.searchsorted(total, self._rng.random() * total[-1], side="right"))
         # The product may round up to the total, which is beyond the last positive weight.
-        return min(index, int(np.flatnonzero(weights)[-1]))
+        return int(self._record(key, min(index, int(np.flatnonzero(weights)[-1]))))
 
     def count(self, key: str, low: int, high: int) -> int:
         """Draw a count uniformly."""
-        return int(self._rng.integers(low, high + 1))
+        return int(self._record(key, int(self._rng.integers(low, high + 1))))
 
     def value(self, key: str, distribution: Distribution) -> float:
         """Draw a value from the distribution."""
-        return distribution.draw(self._rng.random, self._rng.standard_normal)
-
-
-@dataclass
-class RecordedChooser(Chooser):
-    """Records the choices of another chooser."""
-
-    chooser: Chooser
-    choices: dict[str, float] = field(default_factory=dict)  # all choices made so far
-
-    def alternative(self, key: str, weights: list[float]) -> int:
-        """Return the index of the other chooser."""
-        return int(self._record(key, self.chooser.alternative(key, weights)))
-
-    def count(self, key: str, low: int, high: int) -> int:
-        """Return the count of the other chooser."""
-        return int(self._record(key, self.chooser.count(key, low, high)))
-
-    def value(self, key: str, distribution: Distribution) -> float:
-        """Return the value of the other chooser, as a file would hold it."""
-        return self._record(key, float(format_number(self.chooser.value(key, distribution))))
+        drawn = distribution.draw(self._rng.random, self._rng.standard_normal)
+        return self._record(key, float(format_number(drawn)))
 
     def _record(self, key: str, value: float) -> float:
         if key in self.choices:

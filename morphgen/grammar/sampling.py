@@ -17,7 +17,6 @@ from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import (
     Choices,
     RandomChooser,
-    RecordedChooser,
     TooManyPartsError,
     derive,
 )
@@ -75,7 +74,7 @@ def sample_robot(
     name = name or robot_name(grammar, index)
     rejected: Counter[str] = Counter()
     for _ in range(MAX_ATTEMPTS):
-        chooser = RecordedChooser(RandomChooser(rng))
+        chooser = RandomChooser(rng)
         try:
             derivation = derive(grammar, library, chooser)
         except TooManyPartsError:

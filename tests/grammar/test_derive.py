@@ -11,7 +11,6 @@ from morphgen.grammar.derivation import Derivation, outline, parse_derivation
 from morphgen.grammar.derive import (
     Chooser,
     RandomChooser,
-    RecordedChooser,
     TooManyPartsError,
     derive,
 )
@@ -99,7 +98,7 @@ def test_a_let_is_drawn_once_and_an_argument_once_per_copy():
 
 
 def test_two_distributions_in_one_expression_are_drawn_independently():
-    recorded = RecordedChooser(RandomChooser(np.random.default_rng(0)))
+    recorded = RandomChooser(np.random.default_rng(0))
     robot_grammar = grammar("robot -> gantry plane(size=uniform(0.1, 0.2) + uniform(0.1, 0.2))")
     derive(robot_grammar, LIBRARY, recorded)
     assert list(recorded.choices) == ["robot/1.plane.size", "robot/1.plane.size~2"]
@@ -133,7 +132,7 @@ def test_a_weight_may_be_random():
         "robot -> @weight(w) cubes | @weight(1 - w) cartpole | @weight(0) post",
     )
     for seed in range(20):
-        recorded = RecordedChooser(RandomChooser(np.random.default_rng(seed)))
+        recorded = RandomChooser(np.random.default_rng(seed))
         part = derive(robot_grammar, LIBRARY, recorded).part
         assert part == ("cubes" if recorded.choices["let w"] else "cartpole")
 
