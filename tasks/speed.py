@@ -13,6 +13,7 @@ from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.sim.base import is_host
 
 WARM_UP = 20  # number of control steps before the measurement
+SEED = 0  # seed of episodes and actions
 
 
 def random_actions(batch: TaskBatch, count: int, seed: int) -> list[torch.Tensor]:
@@ -31,14 +32,13 @@ def measure_speed(
     batch: TaskBatch,
     seconds: float,
     *,
-    seed: int = 0,
     clock: Callable[[], float] | None = None,
 ) -> float:
     """Return the control steps per second of all environments under random actions, with resets.
 
     The measurement covers whole episodes: the cost of contacts depends on the time since they
-    began, and a faster simulator would otherwise get further into them. The seed gives all
-    simulators the same episodes, since some cost a tenth more than others.
+    began, and a faster simulator would otherwise get further into them. One seed gives
+    all simulators the same episodes, since some cost a tenth more than others.
 
     seconds: Least duration [s]; an episode that began is finished.
     clock: By default one [s] that waits for a GPU, whose work ends after the call.
@@ -46,11 +46,11 @@ def measure_speed(
     if clock is None:
         clock = time.perf_counter if is_host(batch.device) else _time_on_gpu
     episode = int(batch.max_episode_steps.max())
-    actions = random_actions(batch, episode, seed)
+    actions = random_actions(batch, episode, SEED)
     batch.reset()
     for action in actions[:WARM_UP]:
         batch.step(action)
-    batch.reset(seed)  # after the warm-up, for the same episodes in all simulators
+    batch.reset(SEED)  # after the warm-up, for the same episodes in all simulators
     steps = 0
     start = clock()
     while steps % episode or clock() - start < seconds:  # whole episodes

@@ -328,7 +328,6 @@ def _yaws(blocks: Array) -> Array:
 TRIES = 30  # poses of the block to test per required start before giving up
 RESTS = 1e-6  # largest height above the ground of a block that stands on it [m]
 
-
 _CONFIGURATIONS = 1000  # free configurations to test for a start before giving up
 
 
