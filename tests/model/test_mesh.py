@@ -473,7 +473,7 @@ def nested_nodes(levels):
 
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
 REFUSED: dict[str, tuple[str | bytes, str]] = {
-    # more entries than bytes
+    # beyond a bound
     "sixteen.dae": (dae_of().encode("utf-16"), "expected UTF-8"),
     "seven.dae": ('<?xml version="1.0" encoding="UTF-7"?>' + dae_of()[38:], "encoding 'utf-7'"),
     "instances.dae": (

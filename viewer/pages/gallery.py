@@ -119,14 +119,6 @@ def add_filter(gallery: Gallery) -> None:
         _add_dropdown(gallery, "size", "On a page", tuple(map(str, robot_rows.PAGE_SIZES)))
 
 
-def passing_rows(gallery: Gallery) -> list[robot_rows.Row]:
-    """Return the robots that pass the filter, on all pages, in the order of the set."""
-    state = gallery.session.state()
-    return robot_rows.sort_rows(
-        (row for row in gallery.rows if robot_rows.passes(row, state)), "order"
-    )
-
-
 def clear_filter(gallery: Gallery, key: str) -> None:
     """Let every robot pass a condition of the filter, or all conditions without a key."""
     for name in (key,) if key else robot_rows.FILTERS:
@@ -352,7 +344,9 @@ def add_controls(gallery: Gallery) -> None:
 def show_page(gallery: Gallery, number: int) -> None:
     """Show a page of the robots that pass the filter, and request missing thumbnails."""
     session, size = gallery.session, int(gallery.controls["size"].value)
-    rows = robot_rows.sort_rows(passing_rows(gallery), session.state().get("sort") or "order")
+    state = session.state()
+    passing = (row for row in gallery.rows if robot_rows.passes(row, state))
+    rows = robot_rows.sort_rows(passing, state.get("sort") or "order")
     gallery.page_rows, gallery.page_number, count = robot_rows.select_page(rows, number, size)
     session.show_state()
     total = "" if len(rows) == len(gallery.rows) else f" of {len(gallery.rows)}"

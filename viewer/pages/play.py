@@ -42,7 +42,7 @@ def show(session: Session) -> None:
     if not subject and "policy" not in session.address.state:
         show_tasks(session)
         return
-    header = markup.breadcrumbs((uri_name(subject) or "play", None))
+    header = markup.breadcrumbs((subject or "play", None))
     session.open_panel(PANEL_WIDTH, header, "reading")
     trained_on = complete_address(session)
     if (task := session.address.subject) not in TASKS:
