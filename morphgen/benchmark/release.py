@@ -501,7 +501,7 @@ def _goal_fault(goals: SplitGoals, library: Library, sided_member: tuple[Side, M
     try:
         spec = member_spec(member, library, goals.config, shipped=result.goals)
         return next(iter(certify_goal_set(result.goals, spec)), "")
-    except MorphgenError as error:
+    except (MorphgenError, ValueError) as error:  # such as a quaternion of zeros
         return str(error)
 
 

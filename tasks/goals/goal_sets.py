@@ -28,7 +28,7 @@ from morphgen.model.geometry import Pose
 from morphgen.model.robot import Robot
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import Block
-from morphgen.tasks.task import GoalSet, Task, TaskConfig, require_returned
+from morphgen.tasks.task import BOUND, GoalSet, Task, TaskConfig, require_returned
 
 FOLDER = Path(__file__).parents[1] / "goal_set_files"
 """Folder of the compressed sets and of their index."""
@@ -160,7 +160,8 @@ def set_from_npz(content: bytes, kind: type[G]) -> G:
     names = [field.name for field in fields(kind)]
     # Sets are stored without compression; thousands of them may be read from a stranger's folder.
     arrays = read_npz(io.BytesIO(content), names, max_bytes=2**22 + 16 * len(content))
-    return kind(**{name: _value(name, array) for name, array in arrays.items()})
+    types = {each.name: str(getattr(each.type, "__name__", each.type)) for each in fields(kind)}
+    return kind(**{name: _value(name, types[name], array) for name, array in arrays.items()})
 
 
 def arrays_of(goals: GoalSet) -> dict[str, NDArray[Any]]:
@@ -202,9 +203,23 @@ def _array(value: object) -> NDArray[Any]:
     return np.asarray(value)
 
 
-def _value(name: str, array: NDArray[Any]) -> object:
+_SCALARS = {"bool": "b", "int": "iu", "float": "fiu", "str": "U"}
+"""Kinds of NumPy's types that a field of one value may have, by its annotation."""
+
+
+def _value(name: str, annotation: str, array: NDArray[Any]) -> object:
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ValueError(f"{name} has a number that is not finite")
+    if array.dtype.kind == "f" and not (np.abs(array) <= BOUND).all():
+        raise ValueError(f"{name} has a number beyond {BOUND:g}")
+    shape = {"block": (12,), "obstacles": (*array.shape[:1], 12)}.get(name, array.shape)
+    is_scalar = annotation in _SCALARS
+    if (
+        is_scalar != (array.ndim == 0)
+        or array.dtype.kind not in _SCALARS.get(annotation, "bfiu")
+        or array.shape != shape
+    ):
+        raise ValueError(f"{name} has type {array.dtype} and shape {array.shape}")
     if name == "block":
         return _block(array.tolist())
     if name == "obstacles":

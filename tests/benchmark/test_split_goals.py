@@ -285,6 +285,25 @@ def test_verify_certifies_goals_whose_checksums_are_right(home, cache, position,
     assert message in found.why
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("q", "x", "q has type <U1 and shape"),
+        ("line", np.zeros(1), r"line has type float64 and shape \(1,\)"),
+        ("ground", "x", "ground has type <U1"),
+        ("blocks", np.full((4, 7), 1e9), "blocks has a number beyond 1000"),
+        ("block", np.zeros((12, 1)), r"block has type float64 and shape \(12, 1\)"),
+        ("obstacles", np.zeros(12), r"obstacles has type float64 and shape \(12,\)"),
+        ("layouts", 5, r"layouts has type int64 and shape \(\)"),
+    ],
+)
+def test_fields_of_a_wrong_type_or_shape_are_refused(cache, name, value, message, tmp_path):
+    arrays = arrays_of(sample_sets(mixed(), cache)[1].goals) | {name: value}
+    np.savez(tmp_path / "set.npz", **arrays)
+    with pytest.raises(BenchmarkError, match=f"not a goal set for push: {message}"):
+        goals_from_npz((tmp_path / "set.npz").read_bytes(), "push", Path("set.npz"))
+
+
 def test_verify_requires_a_goal_set_of_every_member(home, cache):
     write_goals(home, sample_sets(mixed(), cache)[:2], RECIPE)
     (found,) = verify(home, LIBRARY).differences
