@@ -275,7 +275,7 @@ def conforms(arm, ee, tmp_path, samples):
     folder = write_bundle(robot, tmp_path / robot.name, findings, picture=False)
     report = conformance(folder, samples)
     assert report.passed
-    assert len(report.rows) == len(LOADERS) == 6
+    assert len(report.rows) == len(LOADERS) == 5
     missing = {loader.name for loader in LOADERS if find_spec(loader.module) is None}
     assert {row.loader for row in report.rows if row.message} == missing <= {"pybullet", "usd"}
 
