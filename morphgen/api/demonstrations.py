@@ -235,7 +235,6 @@ def clone(
     jobs: int = 1,
     constants: Mapping[str, float] | Sequence[str] = (),
     tensorboard: bool = True,
-    wandb: bool = False,
     show: Callable[[Subrun], ShowMetrics] | None = None,
 ) -> TrainingRun:
     """Learn the actions of demonstrations: behaviour cloning, and DAgger.
@@ -270,7 +269,6 @@ def clone(
         jobs: Number of processes that record the episodes of ``dagger``.
         constants: Hyperparameters, such as ``{"learning_rate": 1e-4}``, or ``NAME=VALUE`` texts.
         tensorboard: Whether to write TensorBoard events.
-        wandb: Whether to also log metrics to Weights & Biases.
         show: As in ``train``.
 
     Returns:

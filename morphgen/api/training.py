@@ -103,7 +103,6 @@ def train(
     initial: str | PathLike[str] | None = None,
     constants: Mapping[str, float] | Sequence[str] = (),
     tensorboard: bool = True,
-    wandb: bool = False,
     goal_seed: int | None = None,
     goal: str | None = None,
     train_goals: int | None = None,
@@ -156,7 +155,6 @@ def train(
             the run begins with.
         constants: Hyperparameters, such as ``{"learning_rate": 1e-4}``, or ``NAME=VALUE`` texts.
         tensorboard: Whether to write TensorBoard events.
-        wandb: Whether to also log metrics to Weights & Biases.
         goal_seed: Seed of all goals; by default as shipped with the split, else 0.
         goal: Goal of reach: ``position`` (default), within 3 cm, or ``pose``, also 10 degrees.
         train_goals: Number of goals or starts per robot; by default 100, as in evaluations.
@@ -462,7 +460,7 @@ def train_run(folder: Path, config: RunConfig, given: SimpleNamespace) -> Traini
         folder,
         config,
         resume=given.resume,
-        execution=ExecutionConfig(workers, given.tensorboard, given.wandb, given.minutes),
+        execution=ExecutionConfig(workers, given.tensorboard, given.minutes),
         show=given.show,
         begin=begin,
     )

@@ -155,7 +155,7 @@ PAPER = "paper"  # word for all splits of the benchmark
 
 def study(args: argparse.Namespace) -> int:
     """Train, evaluate, write tables, and print failures."""
-    execution = ExecutionConfig(args.workers, args.tensorboard, args.wandb)
+    execution = ExecutionConfig(args.workers, args.tensorboard)
     cells = _cells(args)
     studies.require_cells(cells)
     args.out.mkdir(parents=True, exist_ok=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import signal
@@ -12,9 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Self
 
 import numpy as np
@@ -325,13 +322,10 @@ class ExecutionConfig:
 
     workers: int | None = None  # number of PyBullet processes, or of MuJoCo threads
     tensorboard: bool = True  # write TensorBoard events
-    wandb: bool = False  # send metrics to Weights & Biases
     minutes: int | None = None
     """Time after which training stops with a checkpoint, to be resumed [min]; None for no limit."""
 
     def __post_init__(self) -> None:
-        if self.wandb:
-            require_wandb()
         if self.workers is not None and self.workers < 1:
             raise TaskError(f"--workers {self.workers}: expected 1 or more")
 
@@ -541,10 +535,7 @@ def _learn(
     is_stopped = False
     interval = updates_between(part.config)
     report = show(part) if show else None
-    tensorboard, wandb = execution.tensorboard, execution.wandb
-    with recording(
-        part.folder, part.config, learner.update, tensorboard=tensorboard, wandb=wandb
-    ) as record:
+    with recording(part.folder, learner.update, tensorboard=execution.tensorboard) as record:
         stop.start_clock()
         while not learner.done and not is_stopped:
             metrics = learner.iterate()
@@ -642,9 +633,7 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
 
 
 @contextmanager
-def recording(
-    folder: Path, config: RunConfig, update: int, *, tensorboard: bool, wandb: bool
-) -> Iterator[Recorder]:
+def recording(folder: Path, update: int, *, tensorboard: bool) -> Iterator[Recorder]:
     """Yield the recorder of a run that continues after an update; it is closed at the end.
 
     It writes a line per update, with null for numbers not finite; lines of later updates, which a
@@ -655,23 +644,17 @@ def recording(
     write_atomic(path, "".join(json.dumps(report) + "\n" for report in kept))
     with ExitStack() as stack:
         file = stack.enter_context(path.open("a", encoding="utf-8"))
-        writer = run = None
+        writer = None
         if tensorboard:
             writer = stack.enter_context(closing(_summary_writer(folder, update)))
-        if wandb:
-            run = _wandb_run(folder, config)
-            stack.callback(run.finish)
 
         def record(report: UpdateMetrics) -> None:
             with naming(path):
                 file.write(json.dumps(finite_or_none(asdict(report))) + "\n")
                 file.flush()  # a killed run keeps its lines
-            scalars = dict(_scalars(report))
             if writer is not None:
-                for name, value in scalars.items():
+                for name, value in _scalars(report):
                     writer.add_scalar(name, value, report.update)
-            if run is not None:
-                run.log(scalars, step=report.update)
 
         yield record
 
@@ -685,33 +668,6 @@ def _summary_writer(folder: Path, update: int) -> Any:  # noqa: ANN401
             "TensorBoard is not installed: pip install tensorboard, or say --no-tensorboard"
         ) from error
     return SummaryWriter(str(folder / EVENTS), purge_step=update + 1)
-
-
-def _wandb_run(folder: Path, config: RunConfig) -> Any:  # noqa: ANN401
-    """Begin a run of Weights & Biases, or continue that of the folder."""
-    wandb = require_wandb()
-    try:
-        return wandb.init(
-            project="morphgen",
-            name=str(folder),
-            # The same folder continues the same run; an id has at most 64 characters.
-            id=hashlib.sha256(folder.resolve().as_posix().encode()).hexdigest()[:32],
-            resume="allow",
-            dir=folder,
-            config=config.as_data(),
-        )
-    except wandb.errors.Error as error:
-        raise TaskError(f"--wandb: {error}") from error
-
-
-def require_wandb() -> ModuleType:
-    """Return the module of Weights & Biases."""
-    try:
-        return import_module("wandb")
-    except ImportError as error:
-        raise MissingDependencyError(
-            "--wandb needs the package wandb: pip install wandb"
-        ) from error
 
 
 def _scalars(report: UpdateMetrics) -> Iterator[tuple[str, float]]:

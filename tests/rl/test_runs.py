@@ -7,7 +7,6 @@ import sys
 import time
 from contextlib import nullcontext
 from dataclasses import asdict, fields, replace
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -150,10 +149,9 @@ def test_files_that_are_not_checkpoints_are_rejected(tmp_path):
         read_checkpoint(tmp_path / "none.pt")
 
 
-def record(folder, *reports, after=0, tensorboard=False, wandb=False):
+def record(folder, *reports, after=0, tensorboard=False):
     """Record metrics of a run that continues after an update."""
-    options = {"tensorboard": tensorboard, "wandb": wandb}
-    with recording(folder, small_config(), after, **options) as recorder:
+    with recording(folder, after, tensorboard=tensorboard) as recorder:
         for each in reports:
             recorder(each)
 
@@ -193,38 +191,10 @@ def test_tensorboard_reads_the_events(tmp_path):
     assert [each.value for each in shown.Scalars("terms/distance")] == [-0.5] * 3
 
 
-def test_a_missing_recorder_names_its_package_or_option(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "wandb", None)
+def test_a_missing_tensorboard_names_its_package_and_option(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    with pytest.raises(MissingDependencyError, match="pip install wandb"):
-        record(tmp_path, wandb=True)
     with pytest.raises(MissingDependencyError, match="--no-tensorboard"):
         record(tmp_path, tensorboard=True)
-
-
-class UsageError(Exception):
-    """Stands for the error of wandb without a login."""
-
-
-def test_wandb_gets_scalars_and_its_error_is_one_line(tmp_path, monkeypatch):
-    sent = []
-    log = lambda data, step: sent.append((step, data))  # noqa: E731
-    run = SimpleNamespace(log=log, finish=lambda: sent.append("finished"))
-
-    def init(resume, dir, **options):
-        assert resume == "allow"
-        if not dir.is_dir():
-            raise UsageError("api_key not configured (no-tty)")
-        return run
-
-    wandb = SimpleNamespace(errors=SimpleNamespace(Error=UsageError), init=init)
-    monkeypatch.setitem(sys.modules, "wandb", wandb)
-    record(tmp_path, report(1), wandb=True)
-    (step, data), end = sent
-    assert (step, data["score"], data["terms/distance"], end) == (1, 0.25, -0.5, "finished")
-    wandb.init = lambda **options: init("allow", tmp_path / "none")
-    with pytest.raises(TaskError, match="--wandb: api_key not configured"):
-        record(tmp_path, wandb=True)
 
 
 def test_a_source_needs_a_split_or_a_robot_with_a_task():
