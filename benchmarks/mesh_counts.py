@@ -23,7 +23,7 @@ from tabulate import tabulate
 from morphgen.errors import MeshError
 from morphgen.model.mesh_files import read_mesh_file
 
-SUFFIXES = (".dae", ".obj", ".ply", ".stl")
+SUFFIXES = (".dae", ".obj", ".stl")
 
 
 def count_triangles(path: Path) -> int:
@@ -48,37 +48,6 @@ def _obj(data: bytes) -> int:
     lines = data.replace(b"\\\n", b" ").replace(b"\\\r\n", b" ").split(b"\n")
     words = (line.split(b"#")[0].split() for line in lines)
     return sum(max(len(line) - 3, 0) for line in words if line[:1] == [b"f"])
-
-
-def _ply(data: bytes) -> int:
-    header = data[: data.index(b"end_header")].decode("latin-1")
-    body = data[data.index(b"\n", len(header)) + 1 :]
-    elements = re.findall(r"element (\w+) (\d+)((?:\s+(?!element).*)*)", header)
-    if "ascii" in header:
-        lines = body.split(b"\n")
-        skipped = 0
-        for name, count, _ in elements:
-            if name == "face":
-                rows = lines[skipped : skipped + int(count)]
-                return sum(max(int(row.split()[0]) - 2, 0) for row in rows)
-            skipped += int(count)
-        return 0
-    sizes = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "double": 8, "uint8": 1, "int8": 1}
-    order = ">" if "big" in header else "<"
-    start = total = 0
-    for name, count, text in elements:
-        properties = [line.split()[1:] for line in text.split("\n") if "property" in line]
-        for _ in range(int(count)):
-            for kind, *rest in properties:
-                length = 1
-                if kind == "list":
-                    code = {1: "B", 2: "H", 4: "I"}[sizes.get(rest[0], 4)]
-                    (length,) = struct.unpack_from(order + code, body, start)
-                    start += sizes.get(rest[0], 4)
-                    kind = rest[1]
-                    total += max(length - 2, 0) if name == "face" else 0
-                start += length * sizes.get(kind, 4)
-    return total
 
 
 def _dae(data: bytes) -> int:
@@ -124,7 +93,6 @@ def _dae_geometry(geometry: ElementTree.Element) -> int:
 _COUNTERS = {
     ".dae": _dae,
     ".obj": _obj,
-    ".ply": _ply,
     ".stl": _stl,
 }
 

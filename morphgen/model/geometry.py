@@ -18,7 +18,7 @@ from morphgen.typing import Array
 
 Rgba = tuple[float, float, float, float]
 
-MESH_SUFFIXES = (".dae", ".obj", ".ply", ".stl")
+MESH_SUFFIXES = (".dae", ".obj", ".stl")
 """Suffixes of the mesh files that can be read, in lower case."""
 
 

@@ -1,4 +1,4 @@
-"""Read mesh files from untrusted sources: STL, OBJ and PLY here, other formats by other modules.
+"""Read mesh files from untrusted sources: STL and OBJ here, COLLADA by ``scene_files``.
 
 Every count in a file is compared with the file's bytes before anything is allocated. What trimesh
 would lose or misread is rewritten before it reads the file, left out with a note, or refused.
@@ -10,14 +10,12 @@ import io
 import re
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
 from morphgen.errors import MeshError
 from morphgen.model import scene_files
@@ -31,8 +29,7 @@ def _parts(mesh: trimesh.Trimesh) -> list[MeshPart]:
 
 
 _MAX_TOKENS = 20_000_000  # number of words in the largest OBJ file that is read
-_MAX_HEADER = 2**16
-"""Size of the longest header of a PLY file, and of the longest line of an OBJ file [bytes]."""
+_MAX_LINE = 2**16  # length of the longest line of an OBJ file that is read [characters]
 
 
 def read_mesh_file(path: Path) -> MeshContent:
@@ -66,7 +63,6 @@ def _require_mesh(data: bytes, suffix: str) -> None:
         raise ValueError("the file is a web page; download the mesh itself")
     kinds = {
         ".dae": start.startswith(b"<") and b"<collada" in start,
-        ".ply": re.match(rb"ply\s+format\s", data) is not None,
         ".stl": re.match(rb"solid\b.*\s+facet\s+normal\s", start) is not None,
     }
     actual = next((kind for kind, matches in kinds.items() if matches and kind != suffix), None)
@@ -128,157 +124,6 @@ def _binary_stl(data: bytes, files: scene_files.FolderResolver) -> Array:
     return np.concatenate(solids)
 
 
-_PLY_TYPES = {
-    name: code
-    for code, names in {
-        "i1": "char int8",
-        "u1": "uchar uint8",
-        "i2": "short int16",
-        "u2": "ushort uint16",
-        "i4": "int int32",
-        "u4": "uint uint32",
-        "i8": "int64",
-        "u8": "uint64",
-        "f4": "float float32",
-        "f8": "double float64",
-    }.items()
-    for name in names.split()
-}
-
-
-def _read_ply(data: bytes, files: scene_files.FolderResolver) -> list[MeshPart]:
-    end = data.find(b"end_header", 0, _MAX_HEADER)
-    if not data.startswith(b"ply") or end < 0:
-        raise ValueError(f"no PLY header of at most {_MAX_HEADER} bytes: it is truncated")
-    lines = [line.split() for line in data[:end].decode("latin-1").splitlines()]
-    order = next(line[1] for line in lines if line[:1] == ["format"])
-    body = data[data.index(b"\n", end) + 1 :]
-    byte_order = ">" if "big" in order else "<"
-    if order == "ascii":  # from here on as a binary file of doubles
-        body = scene_files.parse_numbers(body).tobytes()
-    elements: list[tuple[str, int, list[tuple[str, ...]]]] = []
-    for line in lines:
-        match line:
-            case ["element", name, count]:
-                elements.append((name, int(count), []))
-            case ["property", *kinds, name] if elements:
-                codes = ["f8"] * 2 if order == "ascii" else [_PLY_TYPES[k] for k in kinds[-2:]]
-                codes = [byte_order + code for code in codes]
-                is_list = kinds[0] == "list"
-                elements[-1][2].append((name, *(codes if is_list else codes[-1:])))
-            case ["comment", word, *name] if word.lower() == "texturefile":
-                files.left_out.append(f"texture {' '.join(name)!r}")
-    columns: dict[str, dict[str, Any]] = {}
-    start = 0
-    for element, length, properties in elements:
-        columns[element], start = _ply_element(body, start, element, length, properties)
-    return _ply_parts(columns, {name: count for name, count, _ in elements}, files)
-
-
-def _ply_element(
-    body: bytes, start: int, name: str, count: int, properties: list[tuple[str, ...]]
-) -> tuple[dict[str, Any], int]:
-    """Return the columns of an element, lists as one array or one per row, and where it ends."""
-    if count < 0:
-        raise ValueError(f"its header counts {count} of element {name!r}")
-    smallest = count * sum(np.dtype(codes[0]).itemsize for _, *codes in properties)
-    if smallest > len(body) - start:
-        raise ValueError(
-            f"its header counts {count} of element {name!r}, more than the file has bytes for: it "
-            "is truncated"
-        )
-    if not count or not properties:
-        return {}, start
-    rows = _uniform_rows(body, start, count, properties)
-    if rows is not None:
-        return {entry[0]: rows[f"c{i}"] for i, entry in enumerate(properties)}, start + rows.nbytes
-    scene_files.require_faces(
-        count
-    )  # the rows have lists of different lengths, so they are read one by one
-    columns: dict[str, list[Any]] = {entry[0]: [] for entry in properties}
-    for _ in range(count):
-        for column, *codes in properties:
-            length = 1
-            if len(codes) == 2:
-                length = int(np.frombuffer(body, codes[0], 1, start)[0])
-                start += np.dtype(codes[0]).itemsize
-            columns[column].append(np.frombuffer(body, codes[-1], max(length, 0), start))
-            start += columns[column][-1].nbytes
-    return columns, start
-
-
-def _uniform_rows(
-    body: bytes, start: int, count: int, properties: list[tuple[str, ...]]
-) -> NDArray[np.void] | None:
-    """Return rows of an element, with a field ``c0`` per property; None if list lengths differ."""
-    fields: list[Any] = []
-    for i, (_, *codes) in enumerate(properties):
-        if len(codes) == 2:
-            offset = start + np.dtype(fields).itemsize
-            length = int(np.frombuffer(body, codes[0], 1, offset)[0])
-            if not 0 <= length <= len(body):
-                raise ValueError(f"a list of {length} entries")
-            fields += [(f"n{i}", codes[0]), (f"c{i}", codes[1], (length,))]
-        else:
-            fields.append((f"c{i}", codes[0]))
-    if start + count * np.dtype(fields).itemsize > len(body):
-        return None
-    rows = np.frombuffer(body, np.dtype(fields), count, start)
-    lengths = [rows[field[0]] for field in fields if field[0].startswith("n")]
-    return rows if all((column == column[0]).all() for column in lengths) else None
-
-
-_Rows = NDArray[Any] | Sequence[NDArray[Any]]
-"""Lists of a PLY file: an array with a row for each, or an array for each."""
-
-
-def _ply_parts(
-    columns: dict[str, dict[str, Any]], counts: dict[str, int], files: scene_files.FolderResolver
-) -> list[MeshPart]:
-    vertex, face = columns.get("vertex", {}), columns.get("face", {})
-    polygons: _Rows = face.get("vertex_indices", face.get("vertex_index", ()))
-    for name, count in counts.items():
-        if count and name not in ("vertex", "face"):
-            files.left_out.append(f"{count} elements {name!r}")
-    if not {"x", "y", "z"} <= vertex.keys():
-        raise ValueError("holds no vertex with x, y and z")
-    vertices = np.column_stack([vertex[axis] for axis in "xyz"]).astype(np.float64)
-    triangles = np.concatenate([np.empty((0, 3), np.int64), *_fans(polygons, files)])
-    scene_files.require_faces(len(triangles))
-    if not len(triangles):
-        raise ValueError(f"holds {len(vertices)} vertices and no triangle")
-    mesh = trimesh.Trimesh(
-        vertices,
-        triangles,
-        face_colors=_ply_colours(face, len(triangles)),
-        vertex_colors=_ply_colours(vertex, len(vertices)),
-        process=False,
-    )
-    return _parts(mesh)
-
-
-def _ply_colours(columns: dict[str, Any], count: int) -> Array | None:
-    channels = [columns[c] for c in ("red", "green", "blue", "alpha") if c in columns]
-    has_colours = len(channels) >= 3 and all(len(channel) == count for channel in channels)
-    return np.column_stack(channels) if has_colours else None
-
-
-def _fans(polygons: _Rows, files: scene_files.FolderResolver) -> Iterator[NDArray[np.int64]]:
-    """Yield the triangles of polygons: an array with a row for each, or a list of arrays."""
-    by_size: dict[int, list[Any]] = {}
-    if isinstance(polygons, np.ndarray):
-        by_size[polygons.shape[1]] = [polygons]
-    else:
-        for polygon in polygons:
-            by_size.setdefault(len(polygon), []).append(polygon)
-    for size, rows in by_size.items():
-        corners = np.vstack(rows).astype(np.int64)
-        scene_files.require_faces(len(corners) * max(size - 2, 0))
-        yield from (corners[:, [0, k, k + 1]] for k in range(1, size - 1))
-        if size < 3:
-            files.left_out.append(f"{len(corners)} faces of {size} vertices")
-
-
 def _read_obj(data: bytes, files: scene_files.FolderResolver) -> list[MeshPart]:
     """Read an OBJ file by trimesh, rewritten where trimesh misreads it."""
     if data.count(b" ") + data.count(b"\t") > _MAX_TOKENS:
@@ -332,10 +177,10 @@ or zero, more than four or fewer than three corners."""
 
 def _require_short_lines(text: str) -> None:
     start = -1
-    while start + _MAX_HEADER < len(text):
-        end = text.rfind("\n", start + 1, start + 1 + _MAX_HEADER)
+    while start + _MAX_LINE < len(text):
+        end = text.rfind("\n", start + 1, start + 1 + _MAX_LINE)
         if end < 0:
-            raise ValueError(f"a line has more than {_MAX_HEADER} characters")
+            raise ValueError(f"a line has more than {_MAX_LINE} characters")
         start = end
 
 
@@ -402,6 +247,5 @@ def _materials(libraries: list[str], used: set[str], files: scene_files.FolderRe
 _READERS: dict[str, Callable[[bytes, scene_files.FolderResolver], list[MeshPart]]] = {
     ".dae": scene_files.read_dae,
     ".obj": _read_obj,
-    ".ply": _read_ply,
     ".stl": _read_stl,
 }

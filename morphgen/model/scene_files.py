@@ -44,8 +44,7 @@ MAX_FILE_SIZE = 64 * 2**20
 mesh names [bytes]. An STL of ``MAX_FACES`` triangles has 48 MiB."""
 MAX_FACES = 1_000_000
 """Number of triangles of the largest mesh that is read, every instance counted. Reading as many
-from an STL takes 0.5 GiB and 1 s of CPU (``python benchmarks/mesh_counts.py FILE``); text takes
-longer, an ASCII PLY of the largest size 8 s."""
+from an STL takes 0.5 GiB and 1 s of CPU (``python benchmarks/mesh_counts.py FILE``)."""
 MAX_PIXELS = 2**25  # number of pixels of all textures that are read for one mesh, each use counted
 MAX_COORDINATE = 1e9  # coordinate above which a mesh file counts as broken [m]
 MAX_SETS = 5_000

@@ -45,7 +45,7 @@ def box(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("suffix", ["stl", "ascii.stl", "STL", "obj", "ply", "dae"])
+@pytest.mark.parametrize("suffix", ["stl", "ascii.stl", "STL", "obj", "dae"])
 def test_a_box_is_equal_in_every_format(suffix, tmp_path):
     path = tmp_path / f"box.{suffix}"
     box = trimesh.creation.box((0.2, 0.4, 0.6))
@@ -230,16 +230,6 @@ def ascii_stl(faces, name="a", end=True):
     return "\n".join([*lines, f"endsolid {name}" if end else ""]) + "\n"
 
 
-def ply(rows: list[str], *elements: str, style: str = "ascii") -> str:
-    header = [f"ply\nformat {style} 1.0", *elements, "end_header"]
-    return "\n".join([*header, *rows]) + "\n"
-
-
-PLY_VERTICES = "element vertex 4\nproperty float x\nproperty float y\nproperty float z"
-PLY_POINTS = ["0 0 0", "1 0 0", "0 2 0", "0 0 3"]
-PLY_LIST = "property list uchar int vertex_indices"
-
-
 def picture(size=(2, 2), claimed=None):
     """Return a green PNG, whose header may claim another size."""
     stream = io.BytesIO()
@@ -286,8 +276,6 @@ SKIN = """<library_controllers><controller id="c"><skin source="#g">
          "f 2 3 4\n"),
         ("mixed.obj", "v 0 0 0\nv 1 0 0\nv 0 2 0\nv 0 0 3\nvt 0 0\nvn 0 0 1\nf 1//1 3//1 2//1\n"
          "f 1/1 2/1 4/1\nf 1 4/1 3//1\nf 2/1/1 3 4\n"),
-        ("lists.ply", ply([*PLY_POINTS, "3 0 2 1", "3 0 1 3", "3 0 3 2", "3 1 2 3"],
-                          PLY_VERTICES, "element face 4", PLY_LIST)),
         ("polylist.dae", dae_with(f'<polylist count="4">{INPUT}<vcount>3 3 3 3</vcount>'
                                   "<p>0 2 1 0 1 3 0 3 2 1 2 3</p></polylist>")),
         ("polygons.dae", dae_with(f'<polygons count="4">{INPUT}<p>0 2 1</p><p>0 1 3</p>'
@@ -301,44 +289,6 @@ def test_every_form_of_a_tetrahedron_is_read_whole(name, content, tmp_path):
     assert count(mesh) == 4
     assert mesh.left_out == ()
     assert volume(mesh) == pytest.approx(1)
-
-
-@pytest.mark.parametrize(
-    ("rows", "elements", "triangles", "notes"),
-    [
-        (["4 0 1 2 3", "3 0 1 2"], ["element face 2", PLY_LIST], 3, ()),
-        (["5 0 1 2 3 0", "2 0 1"], ["element face 2", PLY_LIST], 3, ("1 faces of 2 vertices",)),
-        (["3 0 1 2", "0 1"], ["element face 1", PLY_LIST, "element edge 1\nproperty int vertex1\n"
-         "property int vertex2"], 1, ("1 elements 'edge'",)),
-        (["3 0 1 2", "4 0 1 2 3"], ["element face 1", PLY_LIST, "element tristrips 1", PLY_LIST], 1,
-         ("1 elements 'tristrips'",)),
-        (["3 0 1 2"], ["comment TextureFile a.png", "element face 1", PLY_LIST], 1,
-         ("texture 'a.png'",)),
-    ],
-)  # fmt: skip
-def test_polygons_of_a_ply_are_triangles_and_the_rest_is_counted(
-    rows, elements, triangles, notes, tmp_path
-):
-    mesh = read(tmp_path, "m.ply", ply([*PLY_POINTS, *rows], PLY_VERTICES, *elements))
-    assert (count(mesh), mesh.left_out) == (triangles, notes)
-
-
-@pytest.mark.parametrize("order", ["little", "big"])
-def test_a_binary_ply_of_triangles_and_quads_with_colours_is_read(order, tmp_path):
-    code = "<" if order == "little" else ">"
-    header = ply(
-        [],
-        PLY_VERTICES,
-        "property uchar red\nproperty uchar green\nproperty uchar blue",
-        "element face 2",
-        PLY_LIST,
-        style=f"binary_{order}_endian",
-    ).encode()
-    points = b"".join(struct.pack(f"{code}3f3B", *p, 255, 0, 0) for p in CORNERS)
-    faces = struct.pack(f"{code}B3iB4i", 3, 0, 1, 2, 4, 0, 1, 2, 3)
-    mesh = read(tmp_path, "m.ply", header + points + faces)
-    assert count(mesh) == 3
-    assert mesh.parts[0].rgba == (1, 0, 0, 1)
 
 
 @pytest.mark.parametrize(
@@ -492,19 +442,6 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
         dae_of(s=("</library_visual_scenes>", "<a/>" * 500_000 + "</library_visual_scenes>")),
         "more than 500000 elements",
     ),
-    "properties.ply": (
-        ply([], "element vertex 1", *(f"property float p{i}" for i in range(200_000))),
-        "no PLY header of at most 65536 bytes",
-    ),
-    "vertices.ply": (
-        ply([], PLY_VERTICES.replace("4", "2000000000"), style="binary_little_endian"),
-        "counts 2000000000 of element 'vertex', more than the file has bytes for",
-    ),
-    "list.ply": (
-        ply([*PLY_POINTS, "1000000000 0 1 2"], PLY_VERTICES, "element face 1", PLY_LIST),
-        "a list of 1000000000 entries",
-    ),
-    "less.ply": (ply([], PLY_VERTICES.replace("4", "-4")), "counts -4 of element 'vertex'"),
     "face.obj": ("v 0 0 0\nf" + " 1" * 40_000 + "\n", "a line has more than 65536 characters"),
     "fan.obj": ("v 0 0 0\nf" + " 1" * 1_100_000 + "\n", "a line has more than 65536 characters"),
     "faces.obj": ("v 0 0 0\n" + ("f" + " 1" * 30_000 + "\n") * 40, "1199920 triangles"),
@@ -517,23 +454,17 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "empty.stl": (b"", "the file is empty"),
     "nan.obj": (b"v nan 0 0\nv 1 0 0\nv 2 1 0\nf 1 2 3\n", "a vertex is not finite"),
     "inf.obj": (b"v 1e999 0 0\nv 1 0 0\nv 2 1 0\nf 1 2 3\n", "a vertex is not finite"),
-    "a.glb": (b"glTF", "cannot read '.glb' meshes; valid: .dae, .obj, .ply, .stl"),
+    "a.glb": (b"glTF", "cannot read '.glb' meshes; valid: .dae, .obj, .stl"),
     "pointer.stl": (LFS, "the file is a Git LFS pointer; run 'git lfs pull'"),
     "page.obj": (b"<!DOCTYPE html>\n<html></html>", "the file is a web page"),
-    "other.stl": (ply([]).encode(), "the file has the content of a .ply file; rename it"),
+    "other.stl": (dae_of().encode(), "the file has the content of a .dae file; rename it"),
     "other.obj": (ascii_stl([0]).encode(), "the file has the content of a .stl file"),
-    "other.ply": (dae_of().encode(), "the file has the content of a .dae file"),
     "cut.stl": (binary_stl()[:200], "4 triangles, which take 284 bytes, and the file has 200"),
     "short.stl": (binary_stl()[:60], "60 bytes; a binary STL file has at least 84"),
     "text.stl": (ascii_stl([0, 1])[:-70].encode(), "truncated or malformed"),
-    "cut.ply": (
-        ply([*PLY_POINTS, "3 0 1 2"], PLY_VERTICES, "element face 9", PLY_LIST),
-        "counts 9 of element 'face', more than the file has bytes for: it is truncated",
-    ),
     "none.stl": (b"solid x\nendsolid x\n", "holds no triangle"),
     "solid.stl": (b"solid" + bytes(2**20), "holds no triangle"),
     "none.obj": (b"v 0 0 0\nl 1 1\n", "holds 1 vertices and no triangle"),
-    "none.ply": (ply(PLY_POINTS, PLY_VERTICES), "holds 4 vertices and no triangle"),
     "none.dae": (dae_with(LINES), "its scene holds no triangle"),
 }  # fmt: skip
 
