@@ -304,9 +304,8 @@ def split(
         library: Folders of your own parts and grammars.
         **choice: Arguments of a new split. A name or rule may also be a list of several.
 
-            - ``hold_out``: parts (``arm=kinova*``), a manufacturer (``manufacturer=Kinova``), a
-              range of a parameter (``arm3.length=0.3..0.4``) or a combination
-              (``arm=ur5+ee=plane``)
+            - ``hold_out``: parts (``arm=kinova*``), a manufacturer (``manufacturer=Kinova``) or
+              a combination (``arm=ur5+ee=plane``)
             - ``regime``: ``interpolation`` with ``grammar`` and ``hull`` (``inside``, ``outside``
               or ``any``); ``composition`` with ``robots``; ``extrapolation`` with
               ``train_category`` and ``test_category`` (grammars)

@@ -312,14 +312,14 @@ def _candidates(
     """Yield every robot of the patterns once for each task."""
     name_by_derivation: dict[str, str] = {}
     for robot in itertools.chain.from_iterable(pattern_robots(p, library) for p in patterns):
-        derivation, name = robot.recipe.derivation, robot.recipe.name
+        derivation, name = robot.derivation, robot.name
         if str(derivation) in name_by_derivation:
             continue
         if name in name_by_derivation.values():
             name = f"{name}-{derivation.digest[:8]}"
         name_by_derivation[str(derivation)] = name
         for task in tasks:
-            yield RuledRobot(name, robot.recipe.category, task, derivation, library)
+            yield RuledRobot(name, robot.category, task, derivation, library)
 
 
 def hold_out_combinations(

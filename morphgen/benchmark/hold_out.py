@@ -16,8 +16,6 @@ from functools import partial
 from itertools import product
 from typing import TypeAlias
 
-import numpy as np
-
 from morphgen.benchmark.generate import (
     MAX_COMPOSED,
     MAX_DRAWS,
@@ -27,15 +25,13 @@ from morphgen.benchmark.generate import (
     members,
     require_size,
 )
-from morphgen.benchmark.regimes import NOTHING, PatternRobot, found, parts, pattern_robots
+from morphgen.benchmark.regimes import NOTHING, found, parts, pattern_robots
 from morphgen.encoding.similarity import is_near
-from morphgen.errors import BenchmarkError, PartError, nearest
-from morphgen.formats.rounding import format_number
+from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
-from morphgen.grammar.manifest import PART_KINDS, Manifest, Parameter, parse_value
-from morphgen.grammar.request import dotted_keys
+from morphgen.grammar.manifest import PART_KINDS, Manifest
 from morphgen.model.findings import Finding
 from morphgen.processes import parallel_map
 from morphgen.progress import part_of, report, stage
@@ -49,41 +45,29 @@ from morphgen.splits.candidates import (
 from morphgen.splits.split import HOLD_OUT, HOLD_OUT_KEY, Split
 
 MANUFACTURER = "manufacturer"  # key of conditions on the manufacturer of a part
-EXAMPLES = "arm=kinova*, manufacturer=Kinova, arm3.length=0.3..0.4 or arm=ur5+ee=plane"
+EXAMPLES = "arm=kinova*, manufacturer=Kinova or arm=ur5+ee=plane"
 """Examples of rules, for messages."""
 
 
 @dataclass(frozen=True)
 class _Condition:
-    """A property of one part of a robot: its name, its manufacturer, or the range of a parameter.
+    """A property of one part of a robot: its name, or its manufacturer.
 
-    ``arm=kinova*``, ``manufacturer=Kinova`` or ``arm.manufacturer=Kinova``, and
-    ``arm3.length=0.3..0.4``, bounds included. Patterns have shell wildcards.
+    ``arm=kinova*``, ``manufacturer=Kinova`` or ``arm.manufacturer=Kinova``. Patterns have shell
+    wildcards.
     """
 
-    owner: str  # kind of the part; for a range also its name, with wildcards; empty for any part
-    key: str = ""  # `MANUFACTURER`, a parameter, or empty for the name of the part
-    pattern: str = ""  # name of the part, or of the manufacturer in any case
-    bounds: tuple[float, float] | None = None  # of a range [SI unit of the parameter]
+    kind: str  # kind of the part; empty for any part
+    key: str  # `MANUFACTURER`, or empty for the name of the part
+    pattern: str  # name of the part, or of the manufacturer in any case
 
     def __str__(self) -> str:
-        where = ".".join(filter(None, (self.owner, self.key)))
-        value = "..".join(map(format_number, self.bounds)) if self.bounds else self.pattern
-        return f"{where}={value}"
+        return f"{'.'.join(filter(None, (self.kind, self.key)))}={self.pattern}"
 
-    def applies_to(self, manifest: Manifest) -> bool:
-        """Return whether a part is of the owner and, for a range, has the parameter."""
-        is_owner = not self.owner or _is_owner(self.owner, manifest)
-        return is_owner and (self.bounds is None or self.key in manifest.attached_parameters)
-
-    def matches(self, manifest: Manifest, values: Mapping[str, float]) -> bool:
-        """Return whether it holds for a part with these values of its parameters."""
-        if not self.applies_to(manifest):
+    def matches(self, manifest: Manifest) -> bool:
+        """Return whether it holds for a part."""
+        if self.kind not in ("", manifest.kind):
             return False
-        if self.bounds is not None:
-            low, high = self.bounds
-            value = values.get(self.key, manifest.attached_parameters[self.key].default)
-            return low <= value <= high
         if self.key == MANUFACTURER:
             name = manifest.manufacturer.lower()
             return bool(name) and fnmatchcase(name, self.pattern.lower())
@@ -91,7 +75,7 @@ class _Condition:
 
     def matches_node(self, node: Derivation, library: Library) -> bool:
         """Return whether it holds for a part of a robot."""
-        return self.matches(library.manifest(node.part), dict(node.parameters))
+        return self.matches(library.manifest(node.part))
 
 
 @dataclass(frozen=True)
@@ -105,8 +89,8 @@ class HoldOutRule:
 
     @property
     def holds_out_parts(self) -> bool:
-        """Whether parts are held out as such, rather than a combination or a range."""
-        return len(self.conditions) == 1 and self.conditions[0].bounds is None
+        """Whether parts are held out as such, rather than a combination."""
+        return len(self.conditions) == 1
 
     def holds(self, derivation: Derivation, library: Library) -> bool:
         """Test if a robot is held out."""
@@ -157,56 +141,16 @@ def _condition(term: str, text: str, library: Library, origin: str) -> _Conditio
     owner, dot, name = key.rpartition(".")
     if key in PART_KINDS:
         _require_match(value, library.names(key), key, where)
-        return _Condition(key, pattern=value)
+        return _Condition(key, "", value)
     if name == MANUFACTURER and (not dot or owner in PART_KINDS):
         condition = _Condition(owner if dot else "", MANUFACTURER, value)
-        manifests = list(filter(condition.applies_to, library.manifests()))
-        if not any(condition.matches(manifest, {}) for manifest in manifests):
+        manifests = [each for each in library.manifests() if owner in ("", each.kind)]
+        if not any(map(condition.matches, manifests)):
             valid = {manifest.manufacturer for manifest in manifests} - {""}
             raise BenchmarkError(f"{where}: no manufacturer {value!r}{nearest(value, valid)}")
         return condition
-    if dot:
-        return _range(owner, name, value, library, where)
-    parameters = dotted_keys((manifest.name, manifest) for manifest in library.manifests())
-    hint = nearest(key, [*PART_KINDS, MANUFACTURER], parameters)
-    raise BenchmarkError(f"{where}: unknown key {key!r}{hint}, or PART.PARAMETER=LOW..HIGH")
-
-
-def _range(owner: str, name: str, value: str, library: Library, where: str) -> _Condition:
-    manifests = [manifest for manifest in library.manifests() if _is_owner(owner, manifest)]
-    if not manifests:
-        _require_match(owner, [*PART_KINDS, *library.paths], "part", where)
-    known = [m.attached_parameters[name] for m in manifests if name in m.attached_parameters]
-    if not known:
-        valid = {parameter for manifest in manifests for parameter in manifest.attached_parameters}
-        raise BenchmarkError(f"{where}: {owner} has no parameter {name!r}{nearest(name, valid)}")
-    if len({parameter.unit for parameter in known}) > 1:
-        raise BenchmarkError(f"{where}: {name!r} has several units in {owner}; name one part")
-    low, dots, high = value.partition("..")
-    if not dots:
-        raise BenchmarkError(
-            f"{where}: {value!r} is no range; expected LOW..HIGH, such as 0.3..0.4"
-        )
-    widest = Parameter(
-        known[0].default,
-        min(parameter.minimum for parameter in known),
-        max(parameter.maximum for parameter in known),
-        known[0].unit,
-        integer=all(parameter.integer for parameter in known),
-    )
-    try:
-        bounds = [parse_value(bound, widest, f"{owner}.{name}") for bound in (low, high)]
-    except PartError as error:
-        raise BenchmarkError(f"{where}: {error}") from error
-    if bounds[0] > bounds[1]:
-        raise BenchmarkError(f"{where}: {low} is above {high}; expected LOW..HIGH")
-    return _Condition(owner, name, bounds=(bounds[0], bounds[1]))
-
-
-def _is_owner(owner: str, manifest: Manifest) -> bool:
-    if owner in PART_KINDS:
-        return manifest.kind == owner
-    return fnmatchcase(manifest.name, owner)
+    valid = [*PART_KINDS, MANUFACTURER]
+    raise BenchmarkError(f"{where}: unknown key {key!r}{nearest(key, valid)}")
 
 
 def _require_match(pattern: str, names: Sequence[str], what: str, where: str) -> None:
@@ -214,10 +158,6 @@ def _require_match(pattern: str, names: Sequence[str], what: str, where: str) ->
         raise BenchmarkError(
             f"{where}: no {what} matches {pattern!r}{nearest(pattern.strip('*?'), names)}"
         )
-
-
-MAX_VALUE_DRAWS = 100
-"""Draws of the values of one robot until it is one that no rule holds out; then it has none."""
 
 
 _Key: TypeAlias = tuple[int, ...]
@@ -282,25 +222,13 @@ def _make_pool(
 ) -> list[_Draft]:
     """Return every robot that may be drawn, each derivation once."""
     drafts: dict[str, _Draft] = {}
+    recipes = (recipe for pattern in patterns for recipe in pattern_robots(pattern, maker.library))
     for draft in (
-        *_from_patterns(request, maker, patterns),
+        *(maker.draft(recipe, recipe.derivation) for recipe in recipes),
         *_from_grammars(request, maker, grammars),
     ):
         drafts.setdefault(str(draft.derivation), draft)
     return list(drafts.values())
-
-
-def _from_patterns(
-    request: SplitRequest, maker: _DraftMaker, patterns: Sequence[str]
-) -> Iterator[_Draft]:
-    robots = [robot for p in patterns for robot in pattern_robots(p, maker.library)]
-    varied = [_varied(robot, maker) for robot in robots]
-    wanted = max(request.train) + request.test
-    # The draws take turns between robots, so few values of each are enough, if not too few.
-    num_values = min(wanted, 4 + 4 * wanted // max(sum(map(bool, varied)), 1))
-    for robot, choices in zip(robots, varied, strict=True):
-        for derivation in _with_values(robot.recipe.derivation, choices, num_values, maker):
-            yield maker.draft(replace(robot.recipe, derivation=derivation), derivation)
 
 
 def _from_grammars(
@@ -322,80 +250,6 @@ def _from_grammars(
             num_repeated += 1
             if num_repeated == MAX_DRAWS:  # the grammar has hardly any others
                 break
-
-
-@dataclass(frozen=True)
-class _Choice:
-    """A parameter whose value is drawn, because a range of it is held out."""
-
-    label: str  # label of the part in the derivation
-    parameter: Parameter
-    condition: _Condition
-
-    def draw(self, rng: np.random.Generator, *, inside: bool) -> float:
-        """Draw a value inside of the held-out range, or from all that are valid."""
-        low, high = self.parameter.minimum, self.parameter.maximum
-        if inside:
-            lowest, highest = self.condition.bounds or (low, high)
-            low, high = max(low, lowest), min(high, highest)
-        if self.parameter.integer:
-            return float(rng.integers(round(low), round(high), endpoint=True))
-        return float(format_number(rng.uniform(low, high)))
-
-
-def _varied(robot: PatternRobot, maker: _DraftMaker) -> list[_Choice]:
-    """Return the parameters with held-out ranges, except those that the pattern sets."""
-    given = {word.partition("=")[0].replace(".", "_") for word in robot.words}
-    conditions = [condition for rule in maker.rules for condition in rule.conditions]
-    choices: list[_Choice] = []
-    for node in robot.recipe.derivation.walk():
-        manifest = maker.library.manifest(node.part)
-        for condition in conditions:
-            if condition.bounds is None or not condition.applies_to(manifest):
-                continue
-            (low, high), parameter = condition.bounds, manifest.attached_parameters[condition.key]
-            overlaps = low <= parameter.maximum and high >= parameter.minimum
-            if overlaps and f"{node.label}_{condition.key}" not in given:
-                choices.append(_Choice(node.label, parameter, condition))
-    return choices
-
-
-def _with_values(
-    derivation: Derivation, choices: Sequence[_Choice], num_values: int, maker: _DraftMaker
-) -> Iterator[Derivation]:
-    """Yield a derivation with drawn values: as many held-out ones as others, if there are any."""
-    if not choices:
-        yield derivation
-        return
-    rng = np.random.default_rng(np.random.SeedSequence([maker.seed, *str(derivation).encode()]))
-    for i in range(num_values):
-        # Of several ranges of one parameter the last one counts: each takes its turn.
-        turn = i % len(choices)
-        in_turn = [*choices[turn:], *choices[:turn]]
-        yield _replace_values(derivation, in_turn, rng, inside=True)
-        for _ in range(MAX_VALUE_DRAWS):
-            drawn = _replace_values(derivation, choices, rng, inside=False)
-            if not any(rule.holds(drawn, maker.library) for rule in maker.rules):
-                yield drawn
-                break
-
-
-def _replace_values(
-    derivation: Derivation, choices: Sequence[_Choice], rng: np.random.Generator, *, inside: bool
-) -> Derivation:
-    values: dict[str, dict[str, float]] = {}
-    for choice in choices:
-        by_name = values.setdefault(choice.label, {})
-        by_name[choice.condition.key] = choice.draw(rng, inside=inside)
-
-    def updated(node: Derivation) -> Derivation:
-        return replace(
-            node,
-            parameters=tuple({**dict(node.parameters), **values.get(node.label, {})}.items()),
-            children=tuple((port, updated(child)) for port, child in node.children),
-        )
-
-    return updated(derivation)
 
 
 def _stratified(

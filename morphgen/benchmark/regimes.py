@@ -33,24 +33,16 @@ _WILDCARD = re.compile(r"[*?[]")
 found = texts_of(Path(__file__).with_name("findings.yaml"))
 
 
-@dataclass(frozen=True)
-class PatternRobot:
-    """A robot that a pattern stands for."""
-
-    words: tuple[str, ...]  # arguments of `morphgen compose`
-    recipe: DerivedRecipe
-
-
-def pattern_robots(pattern: str, library: Library) -> list[PatternRobot]:
+def pattern_robots(pattern: str, library: Library) -> list[DerivedRecipe]:
     """Return a pattern's robots: ``ee=*`` is all parts that fit; ``none`` must be named."""
-    robots: list[PatternRobot] = []
+    robots: list[DerivedRecipe] = []
     for words in expand(pattern):
         choices = [_matching(word, pattern, library) for word in words]
         misfit: CompositionError | None = None
-        fitting: list[PatternRobot] = []
+        fitting: list[DerivedRecipe] = []
         for concrete in itertools.product(*choices):
             try:
-                fitting.append(PatternRobot(concrete, recipe_of(concrete, library)))
+                fitting.append(recipe_of(concrete, library))
             except CompositionError as error:
                 if concrete == words:  # named parts must fit; a wildcard means those that do
                     raise

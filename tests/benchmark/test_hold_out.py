@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from helpers.generated_splits import LIBRARY, order
-from helpers.grammars import grammar, shipped
+from helpers.grammars import grammar
 from helpers.splits import member, split
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.hold_out import (
@@ -17,7 +17,7 @@ from morphgen.benchmark.hold_out import (
     parts_name,
     unique_names,
 )
-from morphgen.benchmark.regimes import parameters, pattern_robots
+from morphgen.benchmark.regimes import pattern_robots
 from morphgen.errors import BenchmarkError, CompositionError, PartError
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.request import parse_words
@@ -92,44 +92,6 @@ def test_both_parts_of_a_held_out_pair_are_trained():
         assert test.name == "lwr+plane"
         assert "lwr" in part_counts(example.train, "arm")
         assert "plane" in part_counts(example.train, "ee")
-
-
-def lengths(members, index):
-    """Return the lengths of the parts number ``index`` of robots."""
-    parsed = (parse_derivation(m.derivation) for m in members)
-    return [parameters(derivation, LIBRARY)[f"{index}.length"] for derivation in parsed]
-
-
-@pytest.mark.parametrize("source", ["grammar", "pattern"])
-def test_a_range_of_a_parameter_is_held_out(source):
-    rules = ["arm3.length=0.3..0.4"]
-    index = 0 if source == "grammar" else 1
-    if source == "grammar":
-        example = made(rules, 5, test=2, patterns=(), grammars=[shipped("arm3")])
-        names = [m.name for m in (*example.train[:2], *example.test)]
-        assert names == ["arm3+claw", *(f"arm3+claw-{number}" for number in (2, 6, 7))]
-        assert "arm3" in example.provenance["grammars"]
-    else:
-        example = made(rules, 5, test=2, patterns=("arm=arm3 ee={cube,plane}",))
-    require_sound(example, rules)
-    train, test = (lengths(side, index) for side in (example.train, example.test))
-    assert all(0.3 <= value <= 0.4 for value in test)
-    assert not any(0.3 <= value <= 0.4 for value in train)
-    assert len(set(train)) == 5
-    # Values that a pattern sets are kept.
-    pattern = "arm=arm3 arm.length={0.2,0.35} ee={cube,plane}"
-    example = made(rules, 2, test=2, patterns=(pattern,))
-    assert set(lengths(example.test, 1)) == {0.35}
-    assert set(lengths(example.train, 1)) == {0.2}
-
-
-def test_two_ranges_of_a_parameter_both_have_test_robots():
-    rules = ["arm3.length=0.15..0.2", "arm3.length=0.4..0.45"]
-    example = made(rules, 3, test=2, patterns=("arm=arm3 ee={cube,plane}",))
-    require_sound(example, rules)
-    low, high = sorted(lengths(example.test, 1))
-    assert 0.15 <= low <= 0.2
-    assert 0.4 <= high <= 0.45
 
 
 def test_draws_from_a_grammar_are_stratified_over_its_parts():
@@ -220,9 +182,9 @@ def test_robots_with_too_many_links_are_left_out_and_counted():
 
 
 def test_the_file_has_hold_out_rules(tmp_path):
-    example = made(["ee=plane,arm3.length=30cm..0.4"], 4, test=2)
+    example = made(["ee=plane,arm.manufacturer=KUKA*"], 4, test=2)
     text = split_text(example)
-    assert "  hold_out: [ee=plane, arm3.length=0.3..0.4]\n" in text
+    assert "  hold_out: [ee=plane, arm.manufacturer=KUKA*]\n" in text
     stored = parse_split(text, tmp_path / "a.yaml")
     assert stored.id == split_id(stored.split)
     assert stored.split == replace(example, provenance=stored.split.provenance)
@@ -299,12 +261,6 @@ def robot(words):
         ("arm.manufacturer=Kinova", "arm=lwr ee=jaco_fingers", False),
         ("manufacturer=*", "arm=arm3 ee=plane", False),
         ("arm=lwr+ee=plane", "arm=lwr ee=plane", True),
-        ("arm3.length=0.3..0.4", "arm=arm3 ee=plane arm.length=0.4", True),
-        ("arm3.length=0.3..0.4", "arm=arm3 ee=plane arm.length=0.401", False),
-        ("arm3.length=..25cm", "arm=arm3 arm.length=0.2", None),
-        ("ee.size=5cm..0.2", "arm=lwr ee=plane", True),
-        ("ee.mount_yaw=45deg..90deg", "arm=lwr ee=plane ee.mount_yaw=1", True),
-        ("hand.fingers=3..3", "arm=lwr ee=hand", True),
     ],
 )
 def test_a_rule_holds_for_robots_with_what_it_names(rule, words, holds):
@@ -317,14 +273,14 @@ def test_a_rule_holds_for_robots_with_what_it_names(rule, words, holds):
 
 
 def test_the_text_of_a_rule_gives_the_same_rule():
-    texts = "arm=kinova*,manufacturer=Kinova,arm.manufacturer=ABB,arm3.length=30cm..0.4"
+    texts = "arm=kinova*,manufacturer=Kinova,arm.manufacturer=ABB"
     rules = parse_rules([f"{texts},arm=ur5+ee=plane"], LIBRARY)
     assert parse_rules([str(rule) for rule in rules], LIBRARY) == rules
-    assert [str(rule) for rule in rules][3:] == ["arm3.length=0.3..0.4", "arm=ur5+ee=plane"]
+    assert [str(rule) for rule in rules][2:] == ["arm.manufacturer=ABB", "arm=ur5+ee=plane"]
 
 
 def test_only_rules_of_one_part_hold_out_the_part_itself():
-    rules = parse_rules(["ee=stick", "arm=lwr+ee=plane", "lwr.upper=0.3..0.5"], LIBRARY)
+    rules = parse_rules(["ee=stick", "arm=lwr+ee=plane"], LIBRARY)
     assert held_out_parts(rules, robot("arm=lwr ee=stick"), LIBRARY) == {"stick"}
     assert held_out_parts(rules, robot("arm=lwr ee=plane"), LIBRARY) == set()
 
@@ -334,16 +290,11 @@ def test_only_rules_of_one_part_hold_out_the_part_itself():
     [
         ("arm=kinva*", "--hold-out arm=kinva*: no arm matches 'kinva*'; did you mean"),
         ("amr=ur5", "unknown key 'amr'; did you mean 'arm'? valid: arm, base, body, ee, manu"),
-        ("arm3_length=0.1..0.2", "unknown key 'arm3_length'; did you mean 'arm3.length'? valid: a"),
+        ("arm3.length=0.1", "unknown key 'arm3.length'; valid: arm, base, body, ee, manufacturer"),
         ("arm", "--hold-out arm: expected KEY=VALUE, such as arm=kinova*, manufacturer=Kinova"),
         ("arm=ur5,", "--hold-out arm=ur5,: empty rule: expected KEY=VALUE"),
         ("arm=ur5,arm=ur5", "arm=ur5 is there twice"),
         ("manufacturer=Kinvoa", "no manufacturer 'Kinvoa'; did you mean 'Kinova'? valid: ABB"),
-        ("amr3.length=0.1..0.2", "no part matches 'amr3'; did you mean 'arm3'"),
-        ("arm3.lenght=0.1..0.2", "arm3 has no parameter 'lenght'; did you mean 'length'? valid"),
-        ("arm3.length=0.3", "'0.3' is no range; expected LOW..HIGH, such as 0.3..0.4"),
-        ("arm3.length=0.3..0.9", "arm3.length=0.9: out of range; expected 0.1 to 0.5 m"),
-        ("arm3.length=0.4..0.3", "0.4 is above 0.3"),
     ],
 )
 def test_an_invalid_rule_is_an_error_that_names_it(text, message):
@@ -354,7 +305,7 @@ def test_an_invalid_rule_is_an_error_that_names_it(text, message):
 
 
 def test_a_wildcard_stands_for_the_parts_that_fit():
-    names = [each.recipe.name for each in pattern_robots("arm={lwr,yumi*} ee=pl*", LIBRARY)]
+    names = [each.name for each in pattern_robots("arm={lwr,yumi*} ee=pl*", LIBRARY)]
     assert names == ["lwr-plane", "yumi_left-plane", "yumi_right-plane"]
     assert len(pattern_robots("arm=lwr ee=*", LIBRARY)) == len(LIBRARY.names("ee")) - 1
     with pytest.raises(CompositionError, match="'yumi' has no port 'flange'"):

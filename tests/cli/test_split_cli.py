@@ -80,8 +80,8 @@ def test_new_prints_a_summary_and_the_next_command(run, ok, tmp_path):
         (COMPOSITION, "", "composition-ee-reach-seed0", (3, 1)),
         (HOLD_OUT, "", "hold-out-ee-plane-reach-seed0", (2, 1)),
         (
-            *(HOLD_OUT, "--hold-out arm3.length=0.3..0.4 --test 2 --task push"),
-            *("hold-out-ee-plane-arm3.length-0.3..0.4-push-seed0", (2, 2)),
+            *(HOLD_OUT, "--hold-out arm=arm3 --test 2 --task push"),
+            *("hold-out-ee-plane-arm-arm3-push-seed0", (2, 2)),
         ),
         (
             *(EXTRAPOLATION, "--test 2 --task reach,push"),
