@@ -1,6 +1,6 @@
 """Time and size of large splits: generating, auditing, building and verifying them.
 
-    python benchmarks/split_scale.py [--train 10,100,1000] [--jobs 1] [--light]
+    python benchmarks/split_scale.py [--train 10,100,1000] [--jobs 1]
 
 Extrapolation from stick, nlink and prims to chain. The splits are generated once, for the largest
 size; a smaller split has the first train robots of the larger one. Each step calls the function
@@ -23,7 +23,7 @@ from tqdm import tqdm
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.generate import SplitRequest, extrapolation
 from morphgen.benchmark.release import verify
-from morphgen.benchmark.split_folder import BuildSettings, build_split
+from morphgen.benchmark.split_folder import build_split
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import default_library
 from morphgen.splits.split import Split
@@ -44,7 +44,6 @@ def main() -> int:
     parser.add_argument("--test", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--light", action="store_true", help="build URDF and derivation only")
     args = parser.parse_args()
     sizes = tuple(int(text) for text in args.train.split(","))
     # The longest chain has 25 links.
@@ -65,16 +64,13 @@ def main() -> int:
 
 def _row(split: Split, args: argparse.Namespace) -> tuple[dict[str, object], bool]:
     library, jobs = default_library(), args.jobs
-    settings = BuildSettings(light=args.light)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         path = folder / "split.yaml"
         write_split(split, path)
         auditing, done = _timed(lambda: audit(split, library, jobs=jobs))
-        building, report = _timed(
-            lambda: build_split(split, folder, library, jobs=jobs, settings=settings)
-        )
-        again, _ = _timed(lambda: build_split(split, folder, library, jobs=jobs, settings=settings))
+        building, report = _timed(lambda: build_split(split, folder, library, jobs=jobs))
+        again, _ = _timed(lambda: build_split(split, folder, library, jobs=jobs))
         by_file, of_file = _timed(lambda: verify(path, library, jobs=jobs))
         by_folder, of_folder = _timed(lambda: verify(report.folder, library, jobs=jobs))
         files = [each for each in report.folder.rglob("*") if each.is_file()]

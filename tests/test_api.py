@@ -148,12 +148,12 @@ def test_a_split_is_chosen_written_built_audited_and_verified(tmp_path, monkeypa
     with pytest.raises(MorphgenError, match=r"own\.yaml exists with another content; choose"):
         morphgen.split("interpolation/arm3/reach").write("own.yaml")
     assert morphgen.split(file).definition == split.definition
-    folder = split.build("data", light=True, goals=True, goal_seed=1)
+    folder = split.build("data", goals=True, goal_seed=1)
     built = morphgen.split(folder)
     assert (built.verify(), split.verify()) == ((), ())
     assert built.audit().passed()
     with pytest.raises(MorphgenError, match="was built with goals: ask for goals"):
-        split.build("data", light=True)
+        split.build("data")
     (folder / "robots" / split.test[0].name / "robot.urdf").write_text("<robot/>")
     assert [each.where for each in built.verify()] == [split.test[0].name]
 

@@ -23,7 +23,6 @@ from morphgen.benchmark.hold_out import hold_out
 from morphgen.benchmark.licences import LicencedPart, licenced_parts
 from morphgen.benchmark.release import build_with_goals, verify
 from morphgen.benchmark.split_folder import (
-    BuildSettings,
     Difference,
     compare_robots,
     read_split_or_folder,
@@ -166,8 +165,6 @@ class LoadedSplit:
         self,
         folder: str | PathLike[str] = "data",
         *,
-        light: bool = False,
-        picture: bool = False,
         goals: bool = False,
         goal_seed: int = 0,
         jobs: int = 1,
@@ -176,7 +173,7 @@ class LoadedSplit:
 
         Examples:
             >>> scenario = morphgen.split("interpolation/arm3/reach")
-            >>> folder = scenario.build("data", light=True, goals=True)
+            >>> folder = scenario.build("data", goals=True)
             >>> print(folder)
             data/interpolation/arm3/reach
             >>> morphgen.split(folder).verify()
@@ -184,8 +181,6 @@ class LoadedSplit:
 
         Args:
             folder: Folder in which the split's folder is created.
-            light: Whether to write only the URDF and the derivation of each robot.
-            picture: Whether to draw ``preview.png`` of each robot.
             goals: Whether to ship the goal set of every robot.
             goal_seed: Seed of the goal sets.
             jobs: Number of processes; the files do not depend on it.
@@ -199,10 +194,10 @@ class LoadedSplit:
             MissingDependencyError: If the extra ``fit`` is needed and missing.
             MorphgenError: If a robot cannot be composed.
         """
-        settings, config = BuildSettings(light=light, picture=picture), GoalConfig(goal_seed)
+        config = GoalConfig(goal_seed)
         sets = sample_split_goals(self.definition, self.library, config, jobs=jobs) if goals else ()
         report = build_with_goals(
-            self.definition, Path(folder), self.library, settings, sets, config, jobs=jobs
+            self.definition, Path(folder), self.library, sets, config, jobs=jobs
         )
         return report.folder
 

@@ -149,8 +149,8 @@ def _condition(term: str, text: str, library: Library, origin: str) -> _Conditio
             valid = {manifest.manufacturer for manifest in manifests} - {""}
             raise BenchmarkError(f"{where}: no manufacturer {value!r}{nearest(value, valid)}")
         return condition
-    valid = [*PART_KINDS, MANUFACTURER]
-    raise BenchmarkError(f"{where}: unknown key {key!r}{nearest(key, valid)}")
+    keys = [*PART_KINDS, MANUFACTURER]
+    raise BenchmarkError(f"{where}: unknown key {key!r}{nearest(key, keys)}")
 
 
 def _require_match(pattern: str, names: Sequence[str], what: str, where: str) -> None:

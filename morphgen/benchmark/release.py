@@ -34,13 +34,11 @@ from morphgen.benchmark import licences
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.scores.submission import EvalProtocol, tasks_of_split
 from morphgen.benchmark.split_folder import (
-    BUNDLED,
     README_FILE,
     ROBOTS_FILE,
     SPLIT_FILE,
     SUMS_FILE,
     BuildReport,
-    BuildSettings,
     Difference,
     build_split,
     compare_folder,
@@ -262,7 +260,6 @@ def build_with_goals(
     split: Split,
     folder: Path,
     library: Library,
-    settings: BuildSettings,
     goals: Sequence[GoalResult] = (),
     config: GoalConfig | None = None,
     *,
@@ -276,7 +273,7 @@ def build_with_goals(
             f"{built} was built with goals: ask for goals (--goals), delete {built / GOALS}, or "
             "name another folder"
         )
-    report = build_split(split, folder, library, jobs=jobs, settings=settings)
+    report = build_split(split, folder, library, jobs=jobs)
     if goals:
         write_goals(report.folder, goals, config or GoalConfig())
     return report
@@ -317,7 +314,6 @@ class ReleaseRequest:
     allowed_licences: tuple[str, ...] = ()  # licences with restrictions that parts may have
     protocol: EvalProtocol = field(default_factory=EvalProtocol)  # rules of the evaluation
     goals: bool = True  # ship the goal set of every robot
-    settings: BuildSettings = BUNDLED  # settings of the build
 
 
 @dataclass(frozen=True)
@@ -386,7 +382,6 @@ def release_split(
             split,
             Path(temporary),
             library,
-            request.settings,
             goals,
             request.protocol.goals,
             jobs=jobs,

@@ -43,7 +43,6 @@ from morphgen.formats.files import begin_folder, folder_hashes, locked_folder
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.formats.zip_files import read_npz
 from morphgen.grammar.library import Library
-from morphgen.grammar.robot_set import light_files, write_light
 from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map
 from morphgen.splits.split import SIDES, Member, Split, compose_member, sided_members, split_id
@@ -167,39 +166,13 @@ class _Settings(records.Record, frozen=True):
 
     format: Literal[1]
     split: str  # id of the split
-    light: bool
-    picture: bool
+    light: Literal[False] = False  # versions until 0.3 had builds without bundles
+    picture: bool = False  # and those with pictures
 
 
 def read_settings(path: Path) -> _Settings:
     """Read ``build.json``."""
     return records.read_record(read_json(path), _Settings, str(path), BenchmarkError)
-
-
-_BUNDLE = (
-    "a folder a body: `robot.urdf`, `robot.xml` (MJCF), `meshes/`, and `card.json` with the\n"
-    "  sources and licences of its parts"
-)
-_LIGHT = (
-    "a folder a body: `robot.urdf`, whose meshes are named where their data packages have\n"
-    "  them, and `derivation.txt`"
-)
-
-
-@dataclass(frozen=True)
-class BuildSettings:
-    """Settings of a build."""
-
-    light: bool = False
-    """Write only URDF and derivation; the URDF refers to the meshes of the data packages."""
-    picture: bool = False  # add `preview.png` to the bundles
-
-    def __post_init__(self) -> None:
-        if self.light and self.picture:
-            raise BenchmarkError("a light build has no pictures; choose one of light and picture")
-
-
-BUNDLED = BuildSettings()
 
 
 def unique_robots(split: Split) -> list[Member]:
@@ -263,7 +236,7 @@ def tokens_npz(split: Split, known: Mapping[str, SurveyedRobot]) -> bytes:
     return content.getvalue()
 
 
-def readme_text(split: Split, settings: BuildSettings) -> str:
+def readme_text(split: Split) -> str:
     """Return the text of ``README.md``."""
     return Template(package_text("split_readme.md")).substitute(
         name=split.name,
@@ -272,7 +245,6 @@ def readme_text(split: Split, settings: BuildSettings) -> str:
         train=len(split.train),
         test=len(split.test),
         id=split_id(split),
-        bundle=_LIGHT if settings.light else _BUNDLE,
         sums=SUMS_FILE,
     )
 
@@ -288,7 +260,7 @@ _REL_TOL, _ABS_TOL = 1e-6, 1e-9
 """Tolerances of the numbers of two cards, which may be rounded on different machines."""
 
 
-def differences(folder: Path, robot: Robot, *, light: bool) -> list[str]:
+def differences(folder: Path, robot: Robot) -> list[str]:
     """Return the differences between a robot's folder and the robot, one line each.
 
     The URDF (without the names of meshes) and the card (without findings and versions) are compared
@@ -296,18 +268,7 @@ def differences(folder: Path, robot: Robot, *, light: bool) -> list[str]:
     """
     if not folder.is_dir():
         return ["its folder is missing"]
-    return list(_light_differences(folder, robot) if light else _differences(folder, robot))
-
-
-def _light_differences(folder: Path, robot: Robot) -> Iterator[str]:
-    expected = light_files(robot)
-    for name, text in expected.items():
-        path = folder / name
-        if not path.is_file():
-            yield f"file {name} is missing"
-        elif path.read_bytes() != text.encode():
-            yield f"file {name} is not the robot's"
-    yield from _extra(folder, expected)
+    return list(_differences(folder, robot))
 
 
 def _differences(folder: Path, robot: Robot) -> Iterator[str]:
@@ -363,7 +324,6 @@ def build_split(
     library: Library,
     *,
     jobs: int = 1,
-    settings: BuildSettings = BUNDLED,
 ) -> BuildReport:
     """Write a split and all its robots to ``folder / split.name``, always the same bytes.
 
@@ -372,7 +332,7 @@ def build_split(
     split_folder = split_folder_path(split, folder)
     members = unique_robots(split)
     with writing_split(split_folder), _removed_if_empty(split_folder):
-        build = _Settings(1, split_id(split), settings.light, settings.picture)
+        build = _Settings(1, split_id(split))
         path = split_folder / BUILD_FILE
         begin_folder(path, msgspec.to_builtins(build), "built split", BenchmarkError)
         write_atomic(split_folder / SPLIT_FILE, split_text(split))
@@ -380,10 +340,10 @@ def build_split(
             (split_folder / SUMS_FILE).unlink(missing_ok=True)  # marks the folder as unfinished
             for leftover in (split_folder / ROBOTS_DIR).glob(".*"):  # of an interrupted build
                 shutil.rmtree(leftover, ignore_errors=True)
-            write = partial(_write_member, library, split_folder, settings, split.max_links)
+            write = partial(_write_member, library, split_folder, split.max_links)
             results = parallel_map(write, members, jobs)
             robots = {member.robot_hash: r for member, r in zip(members, results, strict=True)}
-            _finish(split_folder, split, settings, robots)
+            _finish(split_folder, split, robots)
     num_written = sum(is_new for is_new, _, _ in robots.values())
     return BuildReport(split_folder, num_written, len(robots) - num_written)
 
@@ -400,34 +360,30 @@ _WrittenRobot = tuple[bool, SurveyedRobot, dict[str, str]]
 
 
 def _write_member(
-    library: Library, split_folder: Path, settings: BuildSettings, max_links: int, member: Member
+    library: Library, split_folder: Path, max_links: int, member: Member
 ) -> _WrittenRobot:
     """Write the folder of a member, unless an earlier build has; runs in worker processes."""
     robot = compose_member(member, library)
     encoding.require_max_links(len(robot.links), f"robot {member.name!r}", max_links)
     folder = bundle.bundle_folder(split_folder / ROBOTS_DIR, member.name)
-    is_kept = not differences(folder, robot, light=settings.light)
-    if is_kept and not settings.light:  # written in the same way by this version
+    is_kept = not differences(folder, robot)
+    if is_kept:  # and written in the same way by this version
         versions = read_json(folder / bundle.CARD)["versions"]
         has_picture = (folder / bundle.PICTURE).is_file()
-        is_kept = versions == {"morphgen": version("morphgen")} and has_picture == settings.picture
-    if not is_kept and settings.light:
-        write_light(robot, folder)
-    elif not is_kept:
-        bundle.write_bundle(robot, folder, check(robot), picture=settings.picture, edits_kept=False)
+        is_kept = versions == {"morphgen": version("morphgen")} and not has_picture
+    if not is_kept:
+        bundle.write_bundle(robot, folder, check(robot), picture=False, edits_kept=False)
     measured = measure_robot(robot, library, max_links, with_features=False)
     return not is_kept, measured, folder_hashes(folder)
 
 
-def _finish(
-    split_folder: Path, split: Split, settings: BuildSettings, robots: Mapping[str, _WrittenRobot]
-) -> None:
+def _finish(split_folder: Path, split: Split, robots: Mapping[str, _WrittenRobot]) -> None:
     """Write the files of the whole split, the hashes last."""
     known = {robot_hash: measured for robot_hash, (_, measured, _) in robots.items()}
     lines = (json.dumps(record, ensure_ascii=False) for record in robot_records(split, known))
     write_atomic(split_folder / ROBOTS_FILE, "".join(f"{line}\n" for line in lines))
     write_atomic(split_folder / TOKENS_FILE, tokens_npz(split, known))
-    write_atomic(split_folder / README_FILE, readme_text(split, settings))
+    write_atomic(split_folder / README_FILE, readme_text(split))
     single = (README_FILE, ROBOTS_FILE, BUILD_FILE, SPLIT_FILE, TOKENS_FILE)
     sums = {name: file_sha256(split_folder / name) for name in single}
     paths = robot_paths(split)
@@ -506,39 +462,33 @@ _Inspection = tuple[list[str], SurveyedRobot | None]
 """The differences of a robot and, in a split folder, the robot."""
 
 
-@dataclass(frozen=True, eq=False)
-class _BuiltFolder:
-    """A split folder whose robots are compared."""
-
-    path: Path
-    light: bool
-    robot_paths: Mapping[str, str]  # folder of each robot by its hash
-
-
 def _inspect_member(
-    library: Library, max_links: int, built: _BuiltFolder | None, member: Member
+    library: Library, max_links: int, folders: Mapping[str, Path] | None, member: Member
 ) -> _Inspection:
     """Compose a member, and compare it with its folder; runs in worker processes."""
     try:
         robot = compose_member(member, library)
-        if built is None:
+        if folders is None:
             return [], None
-        folder = built.path / built.robot_paths[member.robot_hash]
+        folder = folders[member.robot_hash]
         # Members with the same robot share the folder of the first one, which is compared.
         is_first = folder.name == member.name
-        lines = differences(folder, robot, light=built.light) if is_first else []
+        lines = differences(folder, robot) if is_first else []
         return lines, measure_robot(robot, library, max_links, with_features=False)
     except MorphgenError as error:
         return [str(error)], None
 
 
 def _inspect(
-    split: Split, library: Library, built: _BuiltFolder | None, jobs: int
+    split: Split, library: Library, folders: Mapping[str, Path] | None, jobs: int
 ) -> dict[tuple[str, str], _Inspection]:
-    """Inspect each different robot once; return the results by derivation and hash."""
+    """Inspect each different robot once; return the results by derivation and hash.
+
+    ``folders`` are those of the robots in a split folder, by hash.
+    """
     members = [member for _, member in reversed(sided_members(split))]  # the first one stays last
     firsts = {(member.derivation, member.robot_hash): member for member in members}
-    inspect = partial(_inspect_member, library, split.max_links, built)
+    inspect = partial(_inspect_member, library, split.max_links, folders)
     return dict(zip(firsts, parallel_map(inspect, list(firsts.values()), jobs), strict=True))
 
 
@@ -561,8 +511,8 @@ def compare_folder(folder: Path, split: Split, library: Library, *, jobs: int) -
     except BenchmarkError as error:
         return [*found, Difference(SPLIT_FILE, str(error))]
     files = list(_file_differences(folder))
-    built = _BuiltFolder(folder, build.light, paths)
-    inspected = _inspect(split, library, built, jobs)
+    folders = {robot_hash: folder / path for robot_hash, path in paths.items()}
+    inspected = _inspect(split, library, folders, jobs)
     # A changed file explains the differences of its robot.
     explained = {difference.where for difference in files}
     robots = _robot_differences(split, inspected)

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from functools import partial
 from typing import IO, TYPE_CHECKING, NoReturn, TypeVar
@@ -21,8 +21,6 @@ if TYPE_CHECKING:  # tqdm is loaded when a bar is drawn
 
     from morphgen.rl.ppo import UpdateMetrics
     from morphgen.rl.runs.training import ShowMetrics, Subrun
-
-    ShowUpdate = Callable[[UpdateMetrics, int, Mapping[str, str]], None]
 
 T = TypeVar("T")
 
@@ -244,12 +242,15 @@ class TrainingProgress(_StagedBar):
         )
 
     def training(self, subrun: Subrun) -> ShowMetrics:
-        """Begin with a subrun; return the function that shows its metrics and what diverged."""
+        """Begin with a subrun; return the function that prints its updates at intervals.
+
+        At the end it is printed how many episodes diverged.
+        """
         from morphgen.rl.runs.robot_source import RecordedSource, SplitSource, tasks_of
 
         raise_if_interrupted()
         self.close()
-        config, source = subrun.config, subrun.config.source
+        source = subrun.config.source
         name = source.name
         if isinstance(source, SplitSource) and source.member:
             name = source.member
@@ -258,68 +259,27 @@ class TrainingProgress(_StagedBar):
         # The score of a step of push is 1 where it succeeds, else 0: its mean says nothing.
         is_relative = any(TASKS[task].relative_to_random for task in tasks_of(source))
         metric = "score" if is_relative else "reward"
-        show = _update_lines(name)
-        if sys.stderr.isatty():
-            from tqdm import tqdm
-
-            shown: tqdm[NoReturn] = tqdm(
-                desc=name,
-                total=config.num_updates * config.ppo.num_steps * config.num_envs,
-                unit="step",
-                unit_scale=True,
-                file=sys.stderr,
-                dynamic_ncols=True,
-            )
-            self._shown.callback(shown.close)
-            show = partial(_draw_update, shown, show)
+        last = -math.inf
 
         def update(report: UpdateMetrics, total: int) -> None:
+            nonlocal last
             counts.update(episodes=report.episodes, diverged=report.unstable)
-            if isinstance(source, RecordedSource):  # nothing acts
-                show(report, total, {"loss": f"{report.policy_loss:.3f}"})
+            if time.monotonic() < last + LINE_INTERVAL and report.update < total:
                 return
+            last = time.monotonic()
             success = f"{report.success:.0%}" if report.episodes else "unknown"
-            show(report, total, {metric: f"{getattr(report, metric):.2f}", "success": success})
+            facts = f"{metric} {getattr(report, metric):.2f}, success {success}"
+            if isinstance(source, RecordedSource):  # nothing acts
+                facts = f"loss {report.policy_loss:.3f}"
+            # Every update has equally many transitions.
+            seconds_left = (total - report.update) * report.transitions / report.update
+            seconds_left /= report.steps_per_second
+            note(
+                f"{name}: update {report.update} of {total}, {report.transitions:,} steps, "
+                f"{facts}, {report.steps_per_second:,.0f} steps/s, {seconds_left / 60:.1f} min left"
+            )
 
         return update
-
-
-def _draw_update(
-    shown: tqdm[NoReturn],
-    print_update: ShowUpdate,
-    report: UpdateMetrics,
-    total: int,
-    facts: Mapping[str, str],
-) -> None:
-    if shown.n == 0:  # a resumed run: the bar begins where the run was interrupted
-        shown.initial = report.transitions - report.transitions // report.update
-        shown.n = shown.initial
-    # A narrow terminal cuts the end off; the scores come last in a line, so first in a bar.
-    shown.set_postfix(dict(reversed([*facts.items()])), refresh=False)
-    shown.update(report.transitions - shown.n)
-    if report.update == total:
-        print_update(report, total, facts)
-
-
-def _update_lines(name: str) -> ShowUpdate:
-    """Return a function that prints the first update, the last one, and others at intervals."""
-    last = -math.inf
-
-    def show(report: UpdateMetrics, total: int, facts: Mapping[str, str]) -> None:
-        nonlocal last
-        if time.monotonic() < last + LINE_INTERVAL and report.update < total:
-            return
-        last = time.monotonic()
-        # Every update has equally many transitions.
-        seconds_left = (total - report.update) * report.transitions / report.update
-        seconds_left /= report.steps_per_second
-        note(
-            f"{name}: update {report.update} of {total}, {report.transitions:,} steps, "
-            f"{', '.join(map(' '.join, facts.items()))}, "
-            f"{report.steps_per_second:,.0f} steps/s, {seconds_left / 60:.1f} min left"
-        )
-
-    return show
 
 
 def _print_divergence(name: str, counts: Counter[str]) -> None:

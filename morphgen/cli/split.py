@@ -122,16 +122,13 @@ def _listed(findings: Sequence[Finding | split_folder.Difference]) -> list[str]:
 
 def build(args: argparse.Namespace) -> None:
     """Build a split and print where it is."""
-    settings = split_folder.BuildSettings(light=args.light, picture=args.picture)
     split, config = read_split(args.split), GoalConfig(args.goal_seed or 0)
     library, goals = opt.library_of(args), list[GoalResult]()
     if args.goals:
         with bar(args, "sampling goals"):
             goals = sample_split_goals(split, library, config, jobs=args.jobs)
     with bar(args, "building"):
-        report = releases.build_with_goals(
-            split, args.out, library, settings, goals, config, jobs=args.jobs
-        )
+        report = releases.build_with_goals(split, args.out, library, goals, config, jobs=args.jobs)
     written, kept = report.num_written, report.num_kept
     data: dict[str, object] = {"folder": str(report.folder), "made": written, "kept": kept}
     lines = [f"{report.folder}: {written} robots written, {kept} already existed"]
@@ -308,7 +305,6 @@ def release(args: argparse.Namespace) -> None:
         ),
         protocol=protocol,
         goals=not args.no_goals,
-        settings=split_folder.BuildSettings(light=args.light),
     )
     releases.require_releasable(split, library, request)
     notes = _notes(args, split, extra)

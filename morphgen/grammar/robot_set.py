@@ -228,20 +228,12 @@ def _record(sample: Sample) -> Record:
 
 
 def write_light(robot: Robot, folder: Path) -> None:
-    """Write the folder of a robot in a light set."""
+    """Write a robot's URDF, whose meshes are those of their data packages, and its derivation."""
     with replacing_folder(folder) as partial:
-        for name, text in light_files(robot).items():
-            (partial / name).write_text(text, encoding="utf-8")
-
-
-def light_files(robot: Robot) -> dict[str, str]:
-    """Return the texts of a composed robot's files in a light set, by name."""
-    return {URDF: light_urdf(robot), DERIVATION: f"{robot.provenance['derivation']}\n"}
-
-
-def light_urdf(robot: Robot) -> str:
-    """Return a URDF whose meshes are named by their URIs in their data packages."""
-    return urdf_text(robot, lambda mesh: portable_uri(mesh.path))
+        urdf = urdf_text(robot, lambda mesh: portable_uri(mesh.path))
+        (partial / URDF).write_text(urdf, encoding="utf-8")
+        text = f"{robot.provenance['derivation']}\n"
+        (partial / DERIVATION).write_text(text, encoding="utf-8")
 
 
 def _require_same_grammar(config: SetConfig) -> None:

@@ -7,7 +7,7 @@ import pytest
 from helpers.caching import once
 from helpers.splits import LIBRARY, combined
 from morphgen.benchmark import survey
-from morphgen.benchmark.split_folder import BUNDLED, BuildSettings, build_split
+from morphgen.benchmark.split_folder import build_split
 from morphgen.splits.candidates import RobotFactory
 
 
@@ -30,35 +30,11 @@ def example_split():
 
 @pytest.fixture(scope="session")
 def built(tmp_path_factory):
-    """Function that builds the split of four robots once with each of the settings."""
-    folders = {}
-
-    def build(settings):
-        if settings not in folders:
-            home = tmp_path_factory.mktemp("built")
-            folders[settings] = build_split(combined(), home, LIBRARY, settings=settings).folder
-        return folders[settings]
-
-    return build
+    """The split of four robots, built."""
+    return build_split(combined(), tmp_path_factory.mktemp("built"), LIBRARY).folder
 
 
 @pytest.fixture
-def copy_of(built, tmp_path):
-    """Function that returns a copy of the built split."""
-
-    def copied(settings):
-        return shutil.copytree(built(settings), tmp_path / "whole" / "mine" / "some")
-
-    return copied
-
-
-@pytest.fixture
-def bundles(copy_of):
-    """A built split with bundles."""
-    return copy_of(BUNDLED)
-
-
-@pytest.fixture(params=[BUNDLED, BuildSettings(light=True)], ids=["bundles", "light"])
-def either(copy_of, request):
-    """A built split with bundles, and a light one."""
-    return copy_of(request.param)
+def bundles(built, tmp_path):
+    """A copy of the built split."""
+    return shutil.copytree(built, tmp_path / "whole" / "mine" / "some")

@@ -13,19 +13,16 @@ import pytest
 from helpers.commands import tree
 from helpers.splits import LIBRARY, TRAIN, combined, member, split
 from morphgen.benchmark.release import verify
-from morphgen.benchmark.split_folder import BUNDLED, BuildSettings, build_split, load_split_folder
+from morphgen.benchmark.split_folder import build_split, load_split_folder
 from morphgen.encoding.tokens import GEOMETRY, ORIGIN, PARENT, pad_tokens, tokens
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats import zip_files as npz_files
 from morphgen.grammar.compose import compose
-from morphgen.grammar.robot_set import light_urdf
 from morphgen.progress import show_progress
 from morphgen.splits import split as split_module
 from morphgen.splits.split import compose_member, split_id
 from morphgen.splits.split_file import read_split, split_text
-
-LIGHT = BuildSettings(light=True)
 
 
 def test_the_folder_has_the_name_of_the_split(tmp_path, example_split):
@@ -78,8 +75,8 @@ def test_max_links_of_a_split_pads_all_tokens(tmp_path):
     example_split = split(["chain beads=7"], ["base=gantry ee=cube"], provenance={"max_links": 25})
     narrow = replace(example_split, provenance={})
     with pytest.raises(BenchmarkError, match=r"robot 'chain-\w+' has 25 links, more than max_li"):
-        build_split(narrow, tmp_path, LIBRARY, settings=LIGHT)
-    built = load_split_folder(build_split(example_split, tmp_path, LIBRARY, settings=LIGHT).folder)
+        build_split(narrow, tmp_path, LIBRARY)
+    built = load_split_folder(build_split(example_split, tmp_path, LIBRARY).folder)
     assert built.tokens.shape == (2, 25, 48)
     assert built.robots[0]["mask"].all()
 
@@ -100,22 +97,10 @@ def test_the_loading_example_of_the_readme_runs(bundles, monkeypatch, capsys):
     assert capsys.readouterr().out.startswith(first)
 
 
-def test_a_light_build_references_meshes_in_their_packages(tmp_path):
-    example_split = split(["arm=ur5 ee=plane"], ["base=planar ee=plane"])
-    folder = build_split(example_split, tmp_path, LIBRARY, settings=LIGHT).folder
-    own = folder / "robots" / "ur5-plane"
-    assert sorted(path.name for path in own.iterdir()) == ["derivation.txt", "robot.urdf"]
-    assert (own / "derivation.txt").read_text() == f"{example_split.train[0].derivation}\n"
-    text = (own / "robot.urdf").read_text()
-    assert text == light_urdf(compose_member(example_split.train[0], LIBRARY))
-    assert 'filename="package://' in text
-    assert "derivation.txt" in (folder / "README.md").read_text()
-
-
 def test_a_robot_listed_twice_is_written_once(tmp_path):
     twin = member("base=gantry ee=plane", "twin", task="reach")
     example_split = combined(test=[twin, *combined().test])
-    report = build_split(example_split, tmp_path, LIBRARY, settings=LIGHT)
+    report = build_split(example_split, tmp_path, LIBRARY)
     assert report.num_written == 4
     names = {path.name for path in (report.folder / "robots").iterdir()}
     assert names == {"gantry-plane", "planar-cube", "gantry-cylinder", "planar-plane"}
@@ -125,20 +110,15 @@ def test_a_robot_listed_twice_is_written_once(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "settings", [BuildSettings(picture=True), LIGHT], ids=["pictures", "light"]
-)
-def test_repeated_and_parallel_builds_have_the_same_bytes(tmp_path, settings):
+def test_repeated_and_parallel_builds_have_the_same_bytes(tmp_path):
     # A worker takes 8.
     cubes = [member(f"cubes cubes.size={20 + i}mm", f"cube-{i}") for i in range(9)]
     example_split = split(cubes, ["arm=ur5 ee=plane"])
-    one = build_split(example_split, tmp_path / "one", LIBRARY, settings=settings)
-    two = build_split(example_split, tmp_path / "two", LIBRARY, settings=settings, jobs=2)
+    one = build_split(example_split, tmp_path / "one", LIBRARY)
+    two = build_split(example_split, tmp_path / "two", LIBRARY, jobs=2)
     assert tree(one.folder) == tree(two.folder)
-    again = build_split(example_split, tmp_path / "one", LIBRARY, settings=settings)
+    again = build_split(example_split, tmp_path / "one", LIBRARY)
     assert (again.num_written, again.num_kept) == (0, 10)
-    pictures = list(one.folder.glob("robots/*/preview.png"))
-    assert len(pictures) == (10 if settings.picture else 0)
     assert tree(one.folder) == tree(two.folder)
 
 
@@ -146,21 +126,20 @@ class Killed(BaseException):
     pass
 
 
-@pytest.mark.parametrize("settings", [BUNDLED, LIGHT], ids=["bundles", "light"])
 @pytest.mark.parametrize("done", [1, 3, 4])
-def test_files_written_before_an_interruption_are_kept(tmp_path, example_split, settings, done):
-    whole = build_split(example_split, tmp_path / "whole", LIBRARY, settings=settings).folder
+def test_files_written_before_an_interruption_are_kept(tmp_path, example_split, done):
+    whole = build_split(example_split, tmp_path / "whole", LIBRARY).folder
 
     def stop(number, total):
         if number == done:
             raise Killed
 
     with pytest.raises(Killed), show_progress(stop):
-        build_split(example_split, tmp_path / "own", LIBRARY, settings=settings)
+        build_split(example_split, tmp_path / "own", LIBRARY)
     own = tmp_path / "own" / "mine" / "some"
     with pytest.raises(BenchmarkError, match="is not finished: it has no SHA256SUMS; build it"):
         load_split_folder(own)
-    report = build_split(example_split, tmp_path / "own", LIBRARY, settings=settings)
+    report = build_split(example_split, tmp_path / "own", LIBRARY)
     assert (report.num_written, report.num_kept) == (4 - done, done)
     assert tree(own) == tree(whole)
 
@@ -211,15 +190,11 @@ def test_changed_robots_and_those_of_another_version_are_rebuilt(tmp_path, bundl
     assert tree(bundles) == before
 
 
-def test_a_folder_of_another_build_is_an_error(tmp_path, bundles, example_split):
+def test_a_folder_of_another_build_is_an_error(tmp_path, bundles):
     before = tree(bundles)
-    for other, settings, message in (
-        (combined(test=["base=planar ee=cylinder"]), BUNDLED, "its split is '[0-9a-f]{32}', not"),
-        (example_split, LIGHT, "its light is False, not True; name another folder"),
-        (example_split, BuildSettings(picture=True), "its picture is False, not True"),
-    ):
-        with pytest.raises(BenchmarkError, match=message):
-            build_split(other, tmp_path / "whole", LIBRARY, settings=settings)
+    other = combined(test=["base=planar ee=cylinder"])
+    with pytest.raises(BenchmarkError, match=r"its split is '[0-9a-f]{32}', not .*; name another"):
+        build_split(other, tmp_path / "whole", LIBRARY)
     assert tree(bundles) == before
 
 
@@ -251,10 +226,10 @@ def test_a_name_shared_by_two_robots_is_an_error(tmp_path):
 def test_a_concurrent_build_in_the_same_folder_is_an_error(tmp_path, example_split):
     def again(done, total):
         with pytest.raises(FormatError, match="is being written by another run"):
-            build_split(example_split, tmp_path, LIBRARY, settings=LIGHT)
+            build_split(example_split, tmp_path, LIBRARY)
 
     with show_progress(again):
-        report = build_split(example_split, tmp_path, LIBRARY, settings=LIGHT)
+        report = build_split(example_split, tmp_path, LIBRARY)
     assert len(load_split_folder(report.folder).robots) == 4
 
 
@@ -422,8 +397,8 @@ def test_every_robot_with_a_wrong_derivation_is_reported(tmp_path, train, differ
     assert all(differences[where] in why for where, why in keys)
 
 
-def test_a_moved_split_folder_passes(either, tmp_path):
-    either.rename(tmp_path / "elsewhere")
+def test_a_moved_split_folder_passes(bundles, tmp_path):
+    bundles.rename(tmp_path / "elsewhere")
     seen = []
     with show_progress(lambda *counts: seen.append(counts)):
         assert difference_keys(tmp_path / "elsewhere") == []
@@ -440,38 +415,37 @@ def test_a_moved_split_folder_passes(either, tmp_path):
     ],
 )
 @pytest.mark.parametrize("change", ["cut", "longer", "gone"])
-def test_a_damaged_file_is_reported(either, path, where, change):
-    data = (either / path).read_bytes()
-    (either / path).write_bytes(data + b"\n" if change == "longer" else data[: len(data) // 2])
+def test_a_damaged_file_is_reported(bundles, path, where, change):
+    data = (bundles / path).read_bytes()
+    (bundles / path).write_bytes(data + b"\n" if change == "longer" else data[: len(data) // 2])
     if change == "gone":
-        (either / path).unlink()
-    findings = difference_keys(either)
+        (bundles / path).unlink()
+    findings = difference_keys(bundles)
     why = "is missing, but SHA256SUMS names it" if change == "gone" else "is not what SHA256SUMS"
     file = path.rpartition("/")[2]
     assert (where, True) in [(place, f"file {file} {why}" in text) for place, text in findings]
     assert {place for place, _ in findings} <= {where, "gantry-plane"}
 
 
-def test_an_extra_file_is_reported(either):
-    (either / "robots" / "planar-cube" / "notes.txt").write_text("mine")
-    (either / "robots" / "stranger").mkdir()
-    (either / "robots" / "stranger" / "robot.urdf").write_text("<robot/>")
-    assert difference_keys(either) == [
+def test_an_extra_file_is_reported(bundles):
+    (bundles / "robots" / "planar-cube" / "notes.txt").write_text("mine")
+    (bundles / "robots" / "stranger").mkdir()
+    (bundles / "robots" / "stranger" / "robot.urdf").write_text("<robot/>")
+    assert difference_keys(bundles) == [
         ("planar-cube", "file notes.txt is not named by SHA256SUMS"),
         ("stranger", "file robot.urdf is not named by SHA256SUMS"),
     ]
 
 
-def test_a_urdf_changed_with_its_checksum_is_reported(either):
-    path = either / "robots" / "planar-cube" / "robot.urdf"
+def test_a_urdf_changed_with_its_checksum_is_reported(bundles):
+    path = bundles / "robots" / "planar-cube" / "robot.urdf"
     path.write_text(path.read_text().replace('effort="', 'effort="1', 1))
     card = path.with_name("card.json")
-    if card.is_file():
-        data = json.loads(card.read_text())
-        data["hashes"]["robot.urdf"] = hashlib.sha256(path.read_bytes()).hexdigest()
-        card.write_text(json.dumps(data))
-    rewrite_checksums(either)
-    assert difference_keys(either) == [("planar-cube", "file robot.urdf is not the robot's")]
+    data = json.loads(card.read_text())
+    data["hashes"]["robot.urdf"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    card.write_text(json.dumps(data))
+    rewrite_checksums(bundles)
+    assert difference_keys(bundles) == [("planar-cube", "file robot.urdf is not the robot's")]
 
 
 @pytest.mark.parametrize(
@@ -513,43 +487,43 @@ def test_meshes_are_verified(tmp_path):
         (lambda lines: lines.pop(), "robots.jsonl it has 3 robots, not 4"),
     ],
 )
-def test_a_record_changed_with_its_checksum_is_reported(either, change, expected):
-    path = either / "robots.jsonl"
+def test_a_record_changed_with_its_checksum_is_reported(bundles, change, expected):
+    path = bundles / "robots.jsonl"
     records = [json.loads(line) for line in path.read_text().splitlines()]
     change(records)
     path.write_text("".join(json.dumps(record) + "\n" for record in records))
-    rewrite_checksums(either)
-    ((where, why),) = difference_keys(either)
+    rewrite_checksums(bundles)
+    ((where, why),) = difference_keys(bundles)
     assert f"{where} {why}".startswith(expected)
 
 
 @pytest.mark.parametrize("field", [PARENT, ORIGIN, GEOMETRY])
-def test_tokens_changed_with_their_checksum_are_reported(either, field):
+def test_tokens_changed_with_their_checksum_are_reported(bundles, field):
     def change(arrays):
         arrays["tokens"][1, 2, field.start] += 0.01
 
-    change_tokens(either, change)
+    change_tokens(bundles, change)
     why = f"tokens.npz: {field.name} of link 2 is not the robot's"
-    assert difference_keys(either) == [("planar-cube", why)]
+    assert difference_keys(bundles) == [("planar-cube", why)]
 
 
-def test_changed_masks_names_and_missing_numbers_of_tokens_are_reported(either):
-    change_tokens(either, lambda arrays: arrays["tokens"].__setitem__((2, 0, 5), np.nan))
-    assert [where for where, _ in difference_keys(either)] == ["gantry-cylinder"]
-    change_tokens(either, lambda arrays: arrays["tokens"].__setitem__((2, 0, 5), 0))
-    change_tokens(either, lambda arrays: arrays["mask"].__setitem__((2, 9), True))
-    assert difference_keys(either) == [
+def test_changed_masks_names_and_missing_numbers_of_tokens_are_reported(bundles):
+    change_tokens(bundles, lambda arrays: arrays["tokens"].__setitem__((2, 0, 5), np.nan))
+    assert [where for where, _ in difference_keys(bundles)] == ["gantry-cylinder"]
+    change_tokens(bundles, lambda arrays: arrays["tokens"].__setitem__((2, 0, 5), 0))
+    change_tokens(bundles, lambda arrays: arrays["mask"].__setitem__((2, 9), True))
+    assert difference_keys(bundles) == [
         ("gantry-cylinder", "tokens.npz: its mask is not that of its links")
     ]
-    change_tokens(either, lambda arrays: arrays["names"].__setitem__(0, "other"))
-    assert difference_keys(either) == [("tokens.npz", "it is not of the 4 robots of split.yaml")]
+    change_tokens(bundles, lambda arrays: arrays["names"].__setitem__(0, "other"))
+    assert difference_keys(bundles) == [("tokens.npz", "it is not of the 4 robots of split.yaml")]
 
 
-def test_an_exchanged_split_file_is_reported(either):
+def test_an_exchanged_split_file_is_reported(bundles):
     other = combined(test=["base=planar ee=cylinder"])
-    (either / "split.yaml").write_text(split_text(other))
-    rewrite_checksums(either)
-    findings = difference_keys(either)
+    (bundles / "split.yaml").write_text(split_text(other))
+    rewrite_checksums(bundles)
+    findings = difference_keys(bundles)
     assert ("build.json", f"it is of split {split_id(combined())}, not of split.yaml") in findings
     assert ("planar-cylinder", "its folder is missing") in findings
 
@@ -558,6 +532,7 @@ def test_an_exchanged_split_file_is_reported(either):
     ("path", "content", "message"),
     [
         ("build.json", b'{"format": 2}', "build.json: format: unknown value 2; valid: 1"),
+        ("build.json", b'{"format": 1, "split": "x", "light": true}', "build.json: light: "),
         ("SHA256SUMS", b"abc\n", "SHA256SUMS:1: expected a hash, two spaces and a path"),
         ("split.yaml", None, "split.yaml: no such file"),
         ("split.yaml", b"format: 1\n", "split.yaml:1: missing key"),

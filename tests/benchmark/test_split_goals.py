@@ -17,7 +17,7 @@ from helpers.scenes import robot
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
 from morphgen.benchmark import release
 from morphgen.benchmark.release import verify, write_goals
-from morphgen.benchmark.split_folder import BuildSettings, build_split, load_split_folder
+from morphgen.benchmark.split_folder import build_split, load_split_folder
 from morphgen.errors import BenchmarkError, MorphgenError, TaskError
 from morphgen.grammar.library import default_library
 from morphgen.progress import show_progress
@@ -185,7 +185,7 @@ def home(built_once, tmp_path):
 
 
 def built(folder, which):
-    return build_split(which, folder, LIBRARY, settings=BuildSettings(light=True)).folder
+    return build_split(which, folder, LIBRARY).folder
 
 
 def test_stored_sets_are_read_back_unchanged(home, cache):
@@ -323,7 +323,7 @@ def test_interrupted_build_is_not_marked_finished(home, cache, monkeypatch):
     with pytest.raises(BenchmarkError, match="is not finished"):
         load_split_folder(home)
     (home / ".goals.old").mkdir()
-    build_split(mixed(), home.parents[1], LIBRARY, settings=BuildSettings(light=True))
+    build_split(mixed(), home.parents[1], LIBRARY)
     write_goals(home, member_sets, RECIPE)
     assert verify(home, LIBRARY).differences == ()
     assert [path.name for path in home.iterdir() if path.name.startswith(".")] == []

@@ -23,7 +23,6 @@ from morphgen.benchmark.release import (
 from morphgen.benchmark.scores.submission import EvalProtocol
 from morphgen.benchmark.split_folder import (
     SUMS_FILE,
-    BuildSettings,
     read_split_or_folder,
     read_sums,
     sums_text,
@@ -34,13 +33,12 @@ from morphgen.grammar.library import default_library
 from morphgen.splits.split import split_id
 
 LIBRARY = default_library()
-LIGHT = ReleaseRequest(
+REQUEST = ReleaseRequest(
     "1.2.0",
     date="2027-01-31",
     creators=("A Lab",),
     url="https://example.org/some",
     goals=False,
-    settings=BuildSettings(light=True),
 )
 LIMITS = ZipLimits(2**30, 10_000)
 
@@ -48,7 +46,7 @@ LIMITS = ZipLimits(2**30, 10_000)
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
     """The release of a small split."""
-    return release_split(combined(), tmp_path_factory.mktemp("out"), LIBRARY, LIGHT)
+    return release_split(combined(), tmp_path_factory.mktemp("out"), LIBRARY, REQUEST)
 
 
 @pytest.fixture
@@ -59,7 +57,7 @@ def folder(report, tmp_path):
 
 
 def test_a_release_gives_the_same_bytes_again(report, tmp_path):
-    again = release_split(combined(), tmp_path / "new", LIBRARY, LIGHT, jobs=2)
+    again = release_split(combined(), tmp_path / "new", LIBRARY, REQUEST, jobs=2)
     assert again.archive.read_bytes() == report.archive.read_bytes()
     assert (again.sha256, again.content) == (report.sha256, report.content)
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["mine-some-1.2.0.zip"]
@@ -139,25 +137,25 @@ def test_croissant_lists_the_files_that_are_there(folder):
     files = [each for each in data["distribution"] if each["@type"] == "cr:FileObject"]
     assert all(sums[each["contentUrl"]] == each["sha256"] for each in files)
     sets = [each["@id"] for each in data["distribution"] if each["@type"] == "cr:FileSet"]
-    assert sets == ["urdf"]  # a light build has no MJCF
+    assert sets == ["urdf", "mjcf"]  # the goals are left out
 
 
 def test_another_content_of_the_same_version_is_refused(tmp_path):
-    first = release_split(combined(), tmp_path, LIBRARY, LIGHT)
+    first = release_split(combined(), tmp_path, LIBRARY, REQUEST)
     before = tree(tmp_path)
     with pytest.raises(BenchmarkError, match="exists with another content"):
-        release_split(combined(), tmp_path, LIBRARY, replace(LIGHT, date="2027-02-01"))
+        release_split(combined(), tmp_path, LIBRARY, replace(REQUEST, date="2027-02-01"))
     assert tree(tmp_path) == before
-    assert release_split(combined(), tmp_path, LIBRARY, LIGHT) == first
+    assert release_split(combined(), tmp_path, LIBRARY, REQUEST) == first
 
 
 def test_leaky_splits_and_restricted_parts_are_not_released(tmp_path):
     leaky = combined(test=[*TEST, member(TRAIN[0], "twin")])
     with pytest.raises(BenchmarkError, match="fails its audit: body-shared at test robot"):
-        release_split(leaky, tmp_path / "out", LIBRARY, LIGHT)
+        release_split(leaky, tmp_path / "out", LIBRARY, REQUEST)
     limited = combined(train=[*TRAIN, "base=gantry ee=sake_ez"])
     with pytest.raises(BenchmarkError, match=r"sake_ez .*--licence-allow CC-BY-NC-ND-4.0"):
-        release_split(limited, tmp_path / "out", LIBRARY, LIGHT)
+        release_split(limited, tmp_path / "out", LIBRARY, REQUEST)
     assert not (tmp_path / "out").exists()
 
 
@@ -173,7 +171,7 @@ def test_leaky_splits_and_restricted_parts_are_not_released(tmp_path):
 )
 def test_invalid_requests_are_refused(tmp_path, change, why):
     with pytest.raises(BenchmarkError) as caught:
-        release_split(combined(), tmp_path / "out", LIBRARY, replace(LIGHT, **change))
+        release_split(combined(), tmp_path / "out", LIBRARY, replace(REQUEST, **change))
     assert str(caught.value).startswith(why)
     assert not (tmp_path / "out").exists()
 

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
-from morphgen.benchmark.split_folder import BuildSettings, build_split
+from morphgen.benchmark.split_folder import build_split
 from morphgen.splits.split_file import split_text
 from morphgen.tasks import free_space
 from morphgen.tasks.registry import TASKS
@@ -106,5 +106,5 @@ def test_single_robot_gets_push_goals_with_obstacles(ok):
 
 
 def test_split_folder_is_accepted_as_split(run, tmp_path):
-    built = build_split(some(), tmp_path / "data", LIBRARY, settings=BuildSettings(light=True))
+    built = build_split(some(), tmp_path / "data", LIBRARY)
     assert run("goals", built.folder)[1].endswith("3 of 3 goal sets are complete, seed 0\n")

@@ -29,7 +29,7 @@ ABBREVIATIONS = {
     "CUBES": "split new interpolation --grammar cubes --train 3",
     "EXTRAPOLATION": "split new extrapolation --train 6 --train-category",
     "HOLD_OUT": "split new --hold-out ee=plane --from 'arm={lwr,arm3} ee={plane,cube}' --train 2",
-    "RELEASE": "split release --light --no-goals",
+    "RELEASE": "split release --no-goals",
     "RUN": " ".join(RUN),
     "DRAWN": f"train task=reach --agent me-mlp --train-goals 3 {' '.join(SMALL)} --robots",
     "STUDY": "study interpolation/arm3/reach",
@@ -108,7 +108,6 @@ split show interpolation/arm3 => no split of this name; did you mean
 split audit broken.yaml => broken.yaml:
 split audit some.yaml --near 1 => --near 1: expected a tree distance and a cosine, such as
 split audit some.yaml --near 2,0.5 => --near 2,0.5: a tree distance is from 0 to 1
-split build some.yaml --light --picture => choose one of light and picture
 split build some.yaml --out file => cannot write to file/mine/some: Not a directory
 split build some.yaml --goal-seed 1 => --goal-seed: only with --goals
 split stats wrong.yaml => robot 'planar-cube': the library has no part 'cubw'

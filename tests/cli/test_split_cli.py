@@ -226,13 +226,13 @@ def test_long_lists_of_findings_are_shortened(run, write):
 
 def test_build_prints_its_folder_and_passes_verify(ok, write):
     path = write(combined())
-    out = ok("split", "build", path, "--light")
+    out = ok("split", "build", path)
     assert out.splitlines() == [
         "data/mine/some: 4 robots written, 0 already existed",
         "verify it anywhere: morphgen split verify data/mine/some",
     ]
     first = tree(Path("data"))
-    out = ok("split", "build", path, "--light", "--json")
+    out = ok("split", "build", path, "--json")
     assert json.loads(out) == {"folder": "data/mine/some", "made": 0, "kept": 4}
     assert tree(Path("data")) == first
     assert len(load_split_folder("data/mine/some").train) == 3
@@ -304,6 +304,6 @@ def reaching(**more):
 
 @pytest.mark.usefixtures("goal_cache")
 def test_goal_seed_is_printed_and_stored(ok, write):
-    out = ok("split", "build", write(reaching()), "--light", "--goals", "--goal-seed", "7")
+    out = ok("split", "build", write(reaching()), "--goals", "--goal-seed", "7")
     assert out.splitlines()[1] == "4 goal sets, seed 7"
     assert {one.seed for one in read_goals("data/mine/some", "train").values()} == {7}

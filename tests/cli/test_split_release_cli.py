@@ -16,7 +16,7 @@ from morphgen.benchmark.scores.submission import EvalProtocol, expected_robots
 from morphgen.grammar.library import default_library
 from morphgen.splits.split_file import read_split, split_text
 
-RELEASE = ("split", "release", "--light", "--no-goals")
+RELEASE = ("split", "release", "--no-goals")
 
 
 def test_release_prints_archive_and_hashes_and_passes_verify(run, ok, small):

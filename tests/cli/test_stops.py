@@ -24,7 +24,7 @@ WRITERS = {
     "compose": ["compose", "prims", "--no-picture", "--out", "out"],
     "import": ["import", "tiny.urdf", "--no-picture", "--out", "out"],
     "sample": ["sample", "chain", "-n", 2, "--light", "--out", "out"],
-    "build": ["split", "build", "interpolation/arm3/reach", "--light", "--out", "out"],
+    "build": ["split", "build", "interpolation/arm3/reach", "--out", "out"],
     "tokens": ["tokens", "prims", "--out", "out.npz"],
     "similarity": ["similarity", "prims", "z1-plane", "--measure", "tree", "--map", "out.png"],
 }
