@@ -340,9 +340,6 @@ class Task(ABC, Generic[C, G]):
     """Whether the reported score is the difference from the random policy's score."""
     relative_distance: bool = True
     """Whether the final distance is also reported relative to the robot's reach."""
-    goal_field: str = ""
-    """Observation field that begins with the desired goal of ``goal_env=True``; empty for a task
-    without that form."""
     num_targets: int = 0
     """Number of points that ``TaskEnvs.target_points`` returns."""
     moves_object: bool = False
@@ -415,34 +412,6 @@ class Task(ABC, Generic[C, G]):
     def scene(self, robot: Robot, goals: G, ground: float) -> Scene:
         """Return the scene of an environment."""
         return Scene(robot, obstacles=goals.obstacles, ground=ground)
-
-    def achieved_goal(
-        self, config: C, tool_pose: NDArray[np.float32], object_pose: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """Return the goal that a state achieves, shape (g,), for a task with a ``goal_field``.
-
-        Args:
-            config: Constants of the task.
-            tool_pose: Pose of the tool in the root frame, shape (7,).
-            object_pose: Pose of the object, shape (7,).
-
-        Raises:
-            TaskError: If the task does not define it.
-        """
-        raise TaskError(f"task {self.name!r} has a goal_field, but no achieved_goal")
-
-    def goal_reward(self, config: C, achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
-        """Return the reward terms that depend on the goal alone, summed, shape (k,).
-
-        Args:
-            config: Constants of the task.
-            achieved: Goals that states achieve, shape (k, g).
-            desired: Goals that they should achieve, shape (k, g).
-
-        Raises:
-            TaskError: If the task does not define it.
-        """
-        raise TaskError(f"task {self.name!r} has a goal_field, but no goal_reward")
 
     def episode_score(self, total: float, last: float, steps: int) -> float:
         """Return the score of an episode: the mean of its steps' scores.

@@ -46,7 +46,6 @@ class EnvOptions(SharedOptions, total=False):
 
     obstacles: bool
     config: TaskConfig | None
-    goal_env: bool
 
 
 class VectorOptions(SharedOptions, total=False):

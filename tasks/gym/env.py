@@ -21,9 +21,7 @@ from numpy.typing import NDArray
 from morphgen.errors import TaskError
 from morphgen.grammar.library import LibraryFolders
 from morphgen.grammar.robot_source import RobotLike
-from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import FramePosition
-from morphgen.model.kinematics_torch import frame_pose
 from morphgen.tasks.actions import ActionDecoder, ActionKind, JointMotion
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.gym.vector import (
@@ -184,10 +182,6 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
 
     ``reset(seed=s)`` begins the same episodes as environment 0 of ``make_batch(..., seed=s)``.
 
-    With ``goal_env=True`` observations are ``achieved_goal``, ``desired_goal`` and
-    ``observation``, a vector of all other entries in the order of their names, as hindsight replay
-    needs them. The reward is then ``compute_reward``: the terms that depend on the goal alone.
-
     A task whose ``TaskEnvs`` has ``formulas``, as all of morphgen's have, steps in NumPy on the CPU
     (``NumpyStepper``), several times as fast as the batch; all results equal the batch's to the
     rounding of single precision. Others, and goals that are poses, step the batch in torch.
@@ -217,7 +211,6 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         max_links: int | None = None,
         render_mode: str | None = None,
         size: tuple[int, int] = SIZE,
-        goal_env: bool = False,
     ) -> None:
         """Load the robot, sample its goal set if it is not cached, and load the simulation.
 
@@ -238,16 +231,9 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
                 f"{config_type.__name__}"
             )
         require_limit(_limit_for_make(), config.max_episode_steps)
-        if goal_env and not task_kind.goal_field:
-            raise TaskError(
-                f"goal_env: task {task} has no goals for hindsight replay; see Task.goal_field"
-            )
         self.task = task
-        self._goal_env = goal_env
-        if goal_env:  # others take an environment with this method for one with goals
-            self.compute_reward = self._reward_of_goals
         batch = make_batch(
-            self.task,
+            task,
             [robot],
             1,
             obstacles=obstacles,
@@ -272,10 +258,9 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         )
         self.action_joints = tuple(robot_links[link - 1].name for link in self.action_links)
         self._was_reset = self._next_has_begun = False
-        self._final_physics: tuple[torch.Tensor, torch.Tensor] | None = None
         is_numpy = steps_in_numpy(batch)
         self._stepper = NumpyStepper(batch, self._without_padding) if is_numpy else None
-        first = self._in_goal_form(self._without_padding(self.batch.observe()))
+        first = self._without_padding(self.batch.observe())
         self.observation_space = cast(
             "gym.Space[NumpyObservation]",
             observation_space({k: v[None] for k, v in first.items()}, task_kind.fields),
@@ -299,8 +284,8 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         if self._stepper is not None:
             self._stepper.begin(observation)
         self._running = self._was_reset = True
-        self._next_has_begun, self._final_states, self._final_physics = False, {}, None
-        return self._in_goal_form(observation), {"self_collision": self._self_collision}
+        self._next_has_begun, self._final_states = False, {}
+        return observation, {"self_collision": self._self_collision}
 
     def step(self, action: NDArray[Any]) -> EnvStep:
         """Act for one control step."""
@@ -313,28 +298,7 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         observation, reward, terminated, truncated, info = step(action)
         self._running = not (terminated or truncated)
         info["self_collision"] = self._self_collision
-        if self._goal_env:
-            observation = self._in_goal_form(observation)
-            goals = observation["achieved_goal"], observation["desired_goal"]
-            reward = float(self._reward_of_goals(*goals, info))
         return observation, reward, terminated, truncated, info
-
-    def _reward_of_goals(
-        self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: object
-    ) -> NDArray[np.float32]:
-        """Return rewards (...) as of ``step`` for goals (..., g), with ``goal_env=True``."""
-        achieved, desired = (
-            np.ascontiguousarray(goals, np.float32) for goals in (achieved_goal, desired_goal)
-        )
-        size = self.observation_space["desired_goal"].shape  # type: ignore[index]  # a Dict
-        if achieved.shape != desired.shape or achieved.shape[-1:] != size:
-            raise TaskError(
-                f"compute_reward: goals of shapes {achieved.shape} and {desired.shape}; expected "
-                f"(..., {size[0]}) both"
-            )
-        rows = (torch.from_numpy(goals.reshape(-1, *size)) for goals in (achieved, desired))
-        rewards = TASKS[self.task].goal_reward(self.env_spec.config, *rows)
-        return rewards.numpy().reshape(achieved.shape[:-1])
 
     def render(self) -> Frame | None:
         """Return a picture, shape (height, width, 3), if ``render_mode`` is ``rgb_array``."""
@@ -353,30 +317,9 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         step = self._step_batch(actions, None, keeps_ends=True)
         if step.terminated[0] or step.truncated[0]:
             self._next_has_begun = True
-            self._final_physics = step.q, step.object_pose
         observation, ended = self._without_padding(step.final_observation), bool(step.terminated)
         info = _info(step, bool(step.diverged))
         return observation, float(step.reward), ended, bool(step.truncated), info
-
-    def _in_goal_form(self, observation: NumpyObservation) -> NumpyObservation:
-        """Return an observation of the current state as ``goal_env`` asks for it."""
-        if not self._goal_env:
-            return observation
-        task, batch = TASKS[self.task], self.batch
-        q, object_pose = self._final_physics or (batch.q, batch.simulation.object_pose)
-        chain = batch.robot_tables.tool_chain
-        tool = Pose.from_matrix(frame_pose(chain, batch.env_robot_index, q)[0].double().numpy())
-        achieved = task.achieved_goal(
-            self.env_spec.config,
-            np.array([*tool.position, *tool.quaternion], np.float32),
-            object_pose[0].clone().numpy(),
-        )
-        rest = {name: value for name, value in observation.items() if name != task.goal_field}
-        return {
-            "achieved_goal": achieved,
-            "desired_goal": observation[task.goal_field][: len(achieved)],
-            "observation": np.concatenate([rest[name].ravel() for name in sorted(rest)]),
-        }
 
     def _without_padding(self, observation: Observation) -> NumpyObservation:
         """Return the observation of a batch of one without padding, masks and foreign fields."""

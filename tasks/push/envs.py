@@ -146,13 +146,6 @@ def push_terms(
     }
 
 
-def goal_terms(config: PushConfig, y: torch.Tensor, line: torch.Tensor) -> torch.Tensor:
-    """Return the sum of the terms that depend on y of block and line alone, shape (k,)."""
-    nothing = torch.zeros_like(y)
-    terms = push_terms(config, positive_part(line - y), nothing, nothing, y > line)
-    return torch.stack([*terms.values()]).sum(0)
-
-
 def curriculum_line(config: PushConfig, line: torch.Tensor, progress: float) -> torch.Tensor:
     """Return the position of the line in a curriculum, shape as ``line``."""
     return line * curriculum_part(config, progress)

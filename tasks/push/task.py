@@ -44,7 +44,6 @@ class Push(ObjectTask[PushConfig, PushStartSet]):
     goal_format = 3
     cache_folder = "pushes-4"
     fields = (OBJECT, LINE)
-    goal_field = "line"
     target = "line"
     goal_files_readme = """\
 - push: `q` (n, dof) are starts, and `blocks` (n, 7) poses of the block, whose centre must cross
@@ -144,20 +143,6 @@ class Push(ObjectTask[PushConfig, PushStartSet]):
         from morphgen.tasks.push.envs import PushEnvs
 
         return PushEnvs(specs, env_spec_index, num_joints)
-
-    def achieved_goal(
-        self, config: PushConfig, tool_pose: NDArray[np.float32], object_pose: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """Return the y of the block's centre."""
-        return object_pose[1:2]
-
-    def goal_reward(
-        self, config: PushConfig, achieved: torch.Tensor, desired: torch.Tensor
-    ) -> torch.Tensor:
-        """Return the terms ``distance`` and ``success`` of blocks at y with lines at others."""
-        from morphgen.tasks.push.envs import goal_terms
-
-        return goal_terms(config, achieved[:, 0], desired[:, 0])
 
     def markers(self, config: PushConfig, goals: PushStartSet) -> tuple[Marker, ...]:
         """Return a strip on the ground, longer than the starts of the block are spread."""

@@ -125,17 +125,6 @@ def reach_terms(
     return terms
 
 
-def goal_terms(config: ReachConfig, achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
-    """Return the sum of the terms that depend on the goal alone; see ``Task.goal_reward``."""
-    angle = None
-    if config.goal == "pose":
-        rotations = (matrix_from_quaternion(poses[:, 3:]) for poses in (achieved, desired))
-        angle = angle_between(*rotations)
-    distance = row_norms(achieved[:, :3] - desired[:, :3])
-    nothing = torch.zeros_like(distance)
-    return torch.stack([*reach_terms(config, distance, nothing, nothing, angle).values()]).sum(0)
-
-
 def anybody_score(config: ReachConfig, distance: A, angle: A | None = None) -> A:
     """Return the score of a step, shape (k,): a bonus where near, else the squared distance."""
     far = -config.score_square * (distance * distance)

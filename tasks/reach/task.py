@@ -98,7 +98,6 @@ class Reach(Task[ReachConfig, ReachGoalSet]):
     cache_folder = "goals-5"
     fields = (GOAL,)
     discrete_actions = True
-    goal_field = "goal"
     goal_files_readme = """\
 - reach: `q` (n, dof) are configurations free of collisions without obstacles, and `poses` (n, 7) of
   the tool at them are the goals; `q` are the starts of episodes, too
@@ -188,20 +187,6 @@ class Reach(Task[ReachConfig, ReachGoalSet]):
         from morphgen.tasks.reach.envs import ReachEnvs
 
         return ReachEnvs(specs, env_spec_index, num_joints)
-
-    def achieved_goal(
-        self, config: ReachConfig, tool_pose: NDArray[np.float32], object_pose: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """Return the position of the tool, or its pose if goals are poses."""
-        return tool_pose if config.goal == "pose" else tool_pose[:3]
-
-    def goal_reward(
-        self, config: ReachConfig, achieved: torch.Tensor, desired: torch.Tensor
-    ) -> torch.Tensor:
-        """Return the terms ``distance`` and ``near``, and ``rotation`` if goals are poses."""
-        from morphgen.tasks.reach.envs import goal_terms
-
-        return goal_terms(config, achieved, desired)
 
     def score_range(self, config: ReachConfig, reach: float) -> tuple[float, float]:
         """Return the score at the farthest distance from a goal, and the score near it."""

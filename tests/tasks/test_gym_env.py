@@ -150,7 +150,7 @@ def test_copies_are_refused(make_any):
     [
         {},
         {"kind": "discrete", "obstacles": True, "sim": "mujoco"},
-        {"render_mode": "rgb_array", "size": FRAME, "goal_env": True},
+        {"render_mode": "rgb_array", "size": FRAME},
         {"observe": {"velocity": True}, "config": {"max_episode_steps": 5}},
         {"contacts": {"scene": False, "self_collision": False}, "layouts": "eval", "max_links": 40},
         {"observe": observation_config(["jacobian"]), "contacts": Contacts(), "cache": Path("c")},
@@ -165,10 +165,9 @@ def test_checkers_accept_every_option(name, options, tmp_path, monkeypatch):
         env = make(name, **options)
         check_env(env.unwrapped, skip_render_check=True)
         check_for_sb3(env.unwrapped, skip_render_check=True)
-    if "goal_env" not in options:
-        with warnings.catch_warnings():  # flattened, there is nothing to warn of
-            warnings.simplefilter("error")
-            check_for_sb3(wrappers.FlattenObservation(make(name, **options)))
+    with warnings.catch_warnings():  # flattened, there is nothing to warn of
+        warnings.simplefilter("error")
+        check_for_sb3(wrappers.FlattenObservation(make(name, **options)))
     said = {str(each.message).partition(":")[0] for each in caught}
     assert all("unconventional shape" in text for text in said), said
     again = gym.make(env.spec)
@@ -295,43 +294,9 @@ def test_options_of_reset_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("name", "config", "terms"),
-    [
-        (REACH, CONFIGS[REACH], ("distance", "near")),
-        (REACH, POSE, ("distance", "near", "rotation")),
-        (PUSH, CONFIGS[PUSH], ("distance", "success")),
-    ],
-)
-def test_goal_environments_compute_rewards_of_other_goals(name, config, terms):
-    with closing(make(name)) as env:
-        assert not env.has_wrapper_attr("compute_reward")
-    with closing(make(name, config=config, goal_env=True, sim="mujoco")) as env:
-        assert set(env.observation_space) == {"achieved_goal", "desired_goal", "observation"}
-        compute_reward = env.get_wrapper_attr("compute_reward")
-        goals, rewards = [], []
-        env.reset(seed=0)
-        for _ in range(2 * STEPS):
-            seen, reward, _, over, info = env.step(env.action_space.sample())
-            goals.append((seen["achieved_goal"], seen["desired_goal"]))
-            rewards.append(reward)
-            assert reward == float(compute_reward(*goals[-1], info))
-            assert reward == pytest.approx(sum(info["terms"][term] for term in terms), abs=1e-5)
-            if over:
-                env.reset()
-        achieved, desired = map(np.array, zip(*goals, strict=True))
-        rows = compute_reward(achieved, desired, [{}] * len(rewards))
-        assert rows.shape == (2 * STEPS,)
-        assert rows == pytest.approx(rewards)
-        assert (compute_reward(achieved, achieved, {}) >= rows).all()
-        with pytest.raises(TaskError, match="goals of shapes"):
-            compute_reward(np.zeros(2), np.zeros(9), {})
-
-
-@pytest.mark.parametrize(
     ("call", "message"),
     [
         (lambda: task_vector(1, task="reach", robto="x"), "'robto'; did you mean 'robot"),
-        (lambda: make_vec(goal_env=True), "unknown option 'goal_env'"),
         (lambda: make_vec(render_mode="rgb"), "did you mean 'rgb_array'"),
         (lambda: make_vec(autoreset_mode="same"), "same: expected SAME_STEP or NEXT_STEP"),
         (lambda: SB3Vector(make_vec(autoreset_mode="NextStep")), "needs a vector with autoreset_"),
