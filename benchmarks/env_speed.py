@@ -10,11 +10,10 @@ step has four physics steps of 5 ms. Rows of a task:
 - raw PyBullet: the same scenes and actions, counting only the time inside `stepSimulation`.
   Targets, states, observations and rewards cost nothing here. With two processes, each steps half
   of the environments; this is the physical limit of the machine.
-- morphgen with PyBullet in one and two processes, and with MuJoCo in one and two threads, with
-  observations, rewards and resets.
-- two independent processes of morphgen with PyBullet: the limit of one batch with two workers that
-  never wait for each other. MuJoCo in a scene without contacts: the limit without collision
-  detection.
+- morphgen with PyBullet, and with MuJoCo in one and two threads, with observations, rewards and
+  resets.
+- two independent processes of morphgen with PyBullet. MuJoCo in a scene without contacts: the limit
+  without collision detection.
 - morphgen with PyBullet without self-collision, which panda-gym lacks, and with panda-gym's 50
   solver iterations (morphgen uses 200 if the scene has a block).
 - panda-gym with its own scene and observation, joint control and the same physics steps: one
@@ -63,7 +62,7 @@ from tqdm import tqdm
 from morphgen.splits.split_file import read_split
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.make import make_batch, make_split_batch
-from morphgen.tasks.sim import bullet_batch as bullet_scene
+from morphgen.tasks.sim import bullet_scene
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts
 from morphgen.tasks.speed import measure_speed, random_actions
 
@@ -140,7 +139,6 @@ def _rows(task: str, robot: str, peer: str, envs: int) -> list[Row]:
     case = f"{task} {robot}"
     ours: list[tuple[str, str, int]] = [
         ("morphgen, PyBullet, 1 process", "pybullet", 1),
-        ("morphgen, PyBullet, 2 processes", "pybullet", 2),
         ("morphgen, MuJoCo, 1 thread", "mujoco", 1),
         ("morphgen, MuJoCo, 2 threads", "mujoco", 2),
     ]

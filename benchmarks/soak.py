@@ -1,6 +1,6 @@
 """Soak test: random actions for minutes, watching for NaN, memory leaks and orphan processes.
 
-    python benchmarks/soak.py [SPLIT] [--minutes 10] [--envs 40] [--sim pybullet] [--workers 2]
+    python benchmarks/soak.py [SPLIT] [--minutes 10] [--envs 40] [--sim pybullet] [--workers 1]
 
 Steps the train robots of a split among obstacles, even if the split's tasks have none. Tests every
 observation and reward. Prints the resident memory of this process and its workers after a tenth of
@@ -42,7 +42,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--envs", type=int, default=40)
     parser.add_argument("--sim", choices=SIMULATORS, default="pybullet")
-    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--workers", type=int, default=1)
     args = parser.parse_args()
     split, library = read_split(args.split), default_library(())
     bodies = [

@@ -63,7 +63,7 @@ class EvalConfig:
     sim: str = DEFAULT_SIMULATOR  # name of the simulator
     seed: int = 0  # seed of the episodes
     workers: int | None = None
-    """Number of PyBullet processes, or of MuJoCo threads; scores do not depend on it."""
+    """Number of MuJoCo threads; scores do not depend on it."""
     tasks: tuple[TaskConfig, ...] = field(default_factory=default_configs)
     """Configs of tasks; other tasks have their defaults."""
 

@@ -13,7 +13,6 @@ import pytest
 
 import morphgen
 from helpers.commands import WITHOUT_PROGRESS
-from helpers.simulators import needs_pybullet
 from morphgen.extras import EXTRAS
 
 ROOT = Path(__file__).parent.parent
@@ -134,12 +133,6 @@ SPLITS_AND_GOALS = (
         ("morphgen.cli.lists", "morphgen", HEAVY),
         ("morphgen.checks", "numpy", (*HEAVY, "fcl", "igl", "lxml", "scipy")),
         (", ".join(f"morphgen.{name}" for name in SPLITS_AND_GOALS.split()), "mujoco", ["torch"]),
-        pytest.param(
-            "morphgen.tasks.sim.bullet_batch",
-            "pybullet",
-            {*HEAVY, "scipy", "lxml"} - {"pybullet"},
-            marks=needs_pybullet,
-        ),
     ],
 )
 def test_importing_modules_loads_only_the_packages_that_they_need(modules, needed, others):

@@ -101,8 +101,8 @@ def evaluate(
         episodes: Least number of episodes per robot.
         steps: Number of control steps per robot, in episodes of full length, without ``episodes``.
         sim: Name of the simulator, by default that of the training.
-        workers: Number of processes of PyBullet, or of threads of MuJoCo; by default as many as
-            the environments and the cores allow.
+        workers: Number of threads of MuJoCo; by default as many as the environments and the cores
+            allow.
         device: Device of the networks: ``cpu`` or ``cuda``.
         seed: Seed of the episodes.
         obstacles: Whether one robot is among obstacles.

@@ -137,8 +137,8 @@ def train(
             with ``resume`` that of the run, as for ``envs`` and ``sim``.
         envs: Number of environments, which the robots share; by default the preset's.
         sim: Name of the simulator, by default ``mujoco``.
-        workers: Number of processes of PyBullet, or of threads of MuJoCo; by default as many as
-            the environments and the cores allow.
+        workers: Number of threads of MuJoCo; by default as many as the environments and the cores
+            allow.
         device: Device of the networks: ``cpu`` or ``cuda``.
         seed: Seed of weights, actions and episodes.
         out: Folder of the run, by default ``runs/SPLIT/AGENT/seedN``.

@@ -320,7 +320,7 @@ ShowMetrics = Callable[[UpdateMetrics, int], None]
 class ExecutionConfig:
     """How a run is executed; the weights do not depend on it."""
 
-    workers: int | None = None  # number of PyBullet processes, or of MuJoCo threads
+    workers: int | None = None  # number of MuJoCo threads
     tensorboard: bool = True  # write TensorBoard events
     minutes: int | None = None
     """Time after which training stops with a checkpoint, to be resumed [min]; None for no limit."""

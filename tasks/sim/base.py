@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ from morphgen.processes import usable_cores
 from morphgen.tasks.sim.articulated import ArticulatedObject
 from morphgen.typing import Array
 
-if TYPE_CHECKING:  # processes of PyBullet need no torch, which takes seconds to load and 200 MB
+if TYPE_CHECKING:  # processes that sample goals need no torch, which takes seconds to load
     import torch
 
 TIMESTEP = 0.005  # physics step: 200 Hz, as in AnyBody [s]
@@ -125,7 +125,7 @@ class Simulation(ABC):
     On a GPU, ``reset`` and ``step`` read no tensor, so that the caller never waits for them.
 
     A new simulation is at rest at the home positions and at the poses of its scenes. Subclasses
-    implement ``_reset``, ``_step`` and ``faults``, which get valid arguments.
+    implement ``_reset`` and ``_step``, which get valid arguments.
     """
 
     q: torch.Tensor
@@ -204,10 +204,6 @@ class Simulation(ABC):
             )
         return self._step(targets)
 
-    @abstractmethod
-    def faults(self) -> dict[int, str]:
-        """Return why each environment diverged in the last step; waits for the device."""
-
     def close(self) -> None:
         """Free everything; a second call does nothing."""
         self._is_closed = True
@@ -268,9 +264,7 @@ class HostSimulation(Simulation):
         self._has_object = np.array([[scene.object is not None] for scene in scenes])
         self._targets: Array = np.zeros(self._is_joint.shape)
         self._seen: torch.Tensor | None = None
-        self._num_steps, self._reset_at = 0, np.zeros(len(scenes), np.int64)
-        self._faults: dict[int, str] = {}
-        self._diverged = torch.zeros(len(scenes), dtype=torch.bool)
+        self._diverged, self._any_diverged = torch.zeros(len(scenes), dtype=torch.bool), False
 
     @abstractmethod
     def _put(
@@ -283,8 +277,8 @@ class HostSimulation(Simulation):
         """Put k environments at rest; all other arguments have k rows."""
 
     @abstractmethod
-    def _advance(self) -> dict[int, str]:
-        """Step towards ``self._targets``; return the reason for each environment that diverged."""
+    def _advance(self) -> Collection[int]:
+        """Step towards ``self._targets``; return the environments that diverged."""
 
     def _reset(
         self,
@@ -307,7 +301,6 @@ class HostSimulation(Simulation):
             self._require_finite("reset to obstacles", moved)
             obstacles = moved[envs]
         self._put(envs, positions[envs], blocks[envs], obstacles)
-        self._reset_at[envs] = self._num_steps
 
     def _step(self, targets: torch.Tensor) -> torch.Tensor:
         """See ``step``."""
@@ -315,19 +308,13 @@ class HostSimulation(Simulation):
             self._seen, self._given = targets, targets.numpy()
         np.copyto(self._targets, self._given, where=self._is_joint)  # padding may be anything
         self._require_finite("targets", self._targets)
-        self._num_steps += 1
-        faults = self._advance()
-        if faults or self._faults:
-            self._faults, self._diverged = {}, self._diverged.new_zeros(len(self.scenes))
-            for env, reason in sorted(faults.items()):
-                steps = self._num_steps - self._reset_at[env]
-                self._faults[env] = f"{self._label(env)}: diverged in step {steps}: {reason}"
+        diverged = self._advance()
+        if diverged or self._any_diverged:
+            self._any_diverged = bool(diverged)
+            self._diverged = self._diverged.new_zeros(len(self.scenes))
+            for env in diverged:
                 self._diverged[env] = True
         return self._diverged
-
-    def faults(self) -> dict[int, str]:
-        """Return why environments diverged in the last step; see ``Simulation.faults``."""
-        return self._faults
 
 
 @dataclass(frozen=True)

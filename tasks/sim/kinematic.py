@@ -99,11 +99,6 @@ class KinematicSimulation(Simulation):
             self._diverged = ~(torch.isfinite(self.q) & torch.isfinite(targets)).all(dim=1)
         return self._diverged
 
-    def faults(self) -> dict[int, str]:
-        """Return why environments diverged in the last step; see ``Simulation.faults``."""
-        envs = torch.nonzero(self._diverged)[:, 0].tolist()
-        return {env: f"{self._label(env)}: a target or position is not finite" for env in envs}
-
 
 def _joint_table(robots: Sequence[Robot]) -> Array:
     """Return constants of the independent joints of R robots, padded with zeros, shape (4, R, J).

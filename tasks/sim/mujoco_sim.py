@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import pairwise
 
@@ -35,9 +35,6 @@ from morphgen.tasks.sim.mujoco_model import PASSIVE, World, worlds
 from morphgen.typing import Array
 
 MAX_SPEED = 1e4  # speed above which a simulation counts as diverged [rad/s or m/s]
-_TOO_FAST = f"a velocity is not finite or beyond {MAX_SPEED:g}"
-_NO_MEMORY = "its contacts do not fit into MuJoCo's memory"
-_FULL = [mujoco.mjtWarning.mjWARN_CONTACTFULL.value, mujoco.mjtWarning.mjWARN_CNSTRFULL.value]
 
 
 class GatheredArrays:
@@ -109,19 +106,15 @@ class MujocoState:
             positions = self._numbers.flat[self._object_at]
             self._object_pose[self._articulated] = self._object_joints.poses(positions)
 
-    def faults(self) -> dict[int, str]:
-        """Return the environments that diverged up to the last ``read``, each with the reason."""
+    def diverged(self) -> list[int]:
+        """Return the environments that diverged, or warned, up to the last ``read``."""
         warnings = self._warnings
         if is_within(self.velocities, MAX_SPEED) and is_within(warnings, 0):
-            return {}
+            return []
         speeds = np.abs(self.velocities)
         slow = [bool((speeds[a:b] <= MAX_SPEED).all()) for a, b in pairwise(self._begin)]
-        full = np.asarray(warnings[:, _FULL].any(axis=1))
-        diverged = ~np.array(slow) | warnings.any(axis=1)
-        return {
-            env: _NO_MEMORY if full[env] else _TOO_FAST
-            for env in np.flatnonzero(full | diverged).tolist()
-        }
+        found: list[int] = np.flatnonzero(~np.array(slow) | warnings.any(axis=1)).tolist()
+        return found
 
 
 BY_ERROR = constant(CONTROL_STEP[1, 0] / CONTROL_PERIOD)
@@ -284,7 +277,7 @@ class MujocoSimulation(HostSimulation):
             mujoco.mj_makeM(world.model, data)
         self._state.read()
 
-    def _advance(self) -> dict[int, str]:
+    def _advance(self) -> Collection[int]:
         """Step; environments also diverge if their contacts do not fit into MuJoCo's memory."""
         # Environments whose state is not finite are named below, whatever MuJoCo warns of.
         with np.errstate(invalid="ignore", over="ignore"), self._warnings:
@@ -292,7 +285,7 @@ class MujocoSimulation(HostSimulation):
             self._control.controls(self._targets, q, qd, self._state.velocities, out=self._controls)
             refused = self._run_threads()
             self._state.read()
-        return self._state.faults() | refused
+        return {*self._state.diverged(), *refused}
 
     def _run_threads(self) -> dict[int, str]:
         """Step all environments; return the ones that MuJoCo could not step, with its reasons."""

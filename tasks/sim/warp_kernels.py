@@ -184,7 +184,6 @@ def find_diverged(
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
     overflow: wp.array[int],
-    out_overflow: wp.array[int],
     out_diverged: wp.array[wp.uint8],
     counts: wp.array2d[int],
 ) -> None:
@@ -206,7 +205,6 @@ def find_diverged(
         if not wp.abs(qvel[world, dof]) <= _MAX_SPEED:
             bad = 1
     bits = overflow[world] & (~ignored_overflow)
-    out_overflow[env] = bits
     if bad != 0:
         wp.atomic_add(counts, group, 0, 1)
     if bits != 0:

@@ -338,7 +338,7 @@ class Group:
             kernels.find_diverged,
             data.nworld,
             [self._joints, IGNORED_OVERFLOW, self._number, *state],
-            [out["overflow"], out["diverged"], out["counts"]],
+            [out["diverged"], out["counts"]],
         )
 
     def reset(self, obstacle_poses: wp.array) -> None:
@@ -413,7 +413,6 @@ def _array(values: object, dtype: Callable[..., object]) -> wp.array:
 
 _log = logging.getLogger(__name__)
 REPORT_AFTER = 10.0  # time after which loading reports its progress again [s]
-DIVERGED = "a target or the state is not finite, or a velocity is too large"
 
 
 class WarpSimulation(Simulation):
@@ -451,7 +450,6 @@ class WarpSimulation(Simulation):
         tensors = {name: torch.zeros(shape, device=self.device) for name, shape in shapes.items()}
         for name, shape, dtype in (
             ("counts", (len(found), 2), torch.int32),
-            ("overflow", (n,), torch.int32),
             ("diverged", (n,), torch.uint8),
             ("mask", (n,), torch.uint8),
         ):
@@ -499,17 +497,6 @@ class WarpSimulation(Simulation):
                 for group in self._groups:
                     group.step()
         return self._tensors["diverged"].bool()
-
-    def faults(self) -> dict[int, str]:
-        """Return why environments diverged in the last step; see ``Simulation.faults``."""
-        overflow, diverged = (self._tensors[name].tolist() for name in ("overflow", "diverged"))
-        faults = {}
-        for env, bits in enumerate(overflow):
-            if diverged[env]:
-                name = OverflowType(bits & int(OverflowType.ALL)).name
-                memory = f"its contacts do not fit into MuJoCo Warp's memory ({name})"
-                faults[env] = f"{self._label(env)}: diverged: {memory if bits else DIVERGED}"
-        return faults
 
     def close(self) -> None:
         """Free everything; a second call does nothing."""

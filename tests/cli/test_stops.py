@@ -14,7 +14,6 @@ import pytest
 
 from helpers.commands import heed_ctrl_c, tree
 from helpers.runs import small_split
-from helpers.simulators import needs_pybullet
 from morphgen.formats import files
 from morphgen.splits.split_file import split_text
 
@@ -164,16 +163,11 @@ def test_a_journal_and_metrics_on_a_full_disk_are_named(tmp_path):
 
 COMMANDS = {
     "sample": ["sample", "chain", "-n", 40, "--jobs", 2, "--light", "--out", "out"],
-    "train": [
-        *["train", "planar-cube", "task=reach", "--agent", "me-mlp", "--envs", 4, "--steps", 2048],
-        *["--sim", "pybullet", "--workers", 2, "--out", "out"],
-    ],
     "goals": ["goals", "split.yaml", "--jobs", 2],
     "split": [
         *["split", "new", "interpolation", "--grammar", "chain", "--train", 20, "--test", 20],
         *["--task", "reach", "--jobs", 2, "--out", "out.yaml"],
     ],
-    "eval": ["eval", "ik", "--split", "split.yaml", "--sim", "pybullet", "--workers", 2],
 }
 PATIENCE = 120.0
 """Seconds to wait for a worker, and then for the end."""
@@ -181,16 +175,13 @@ PATIENCE = 120.0
 
 @pytest.mark.slow
 @pytest.mark.parametrize("later", [0.0, 0.3])
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=needs_pybullet if "pybullet" in COMMANDS[n] else []) for n in COMMANDS],
-)
+@pytest.mark.parametrize("name", COMMANDS)
 def test_ctrl_c_while_workers_start_prints_one_line(tmp_path, name, later):
     check(tmp_path, name, later)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["sample", "goals", "split"])
+@pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_the_end_of_a_session_stops_workers_as_ctrl_c_does(tmp_path, name, number):
     check(tmp_path, name, 0.3, number)
@@ -221,10 +212,7 @@ def check(tmp_path, name, later, number=signal.SIGINT):
         assert (process.returncode, out) == (128 + number, "")
         *updates, line = err.splitlines()
         assert line.startswith("morphgen: interrupted; ")
-        # A training ends the update that it has begun, so that its checkpoint is worth a resume.
-        updates = [each for each in updates if not re.search(r", \d+ s$", each)]  # no progress
-        said = re.compile("training .* steps in .* environments|.*: update ")
-        assert all(name == "train" and said.match(each) for each in updates)
+        assert all(re.search(r", \d+ s$", each) for each in updates)  # progress
         while group(process.pid) and time.monotonic() < deadline + PATIENCE:
             time.sleep(0.05)  # the resource tracker ends after the other processes
         assert group(process.pid) == {}

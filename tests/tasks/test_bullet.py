@@ -1,24 +1,14 @@
-"""PyBullet: resets, clients, joints, motor forces, contacts, friction, worker processes."""
+"""PyBullet: resets, clients, joints, motor forces, contacts, friction."""
 
 import gc
-import os
-import re
-import signal
-import subprocess
-import sys
 import tempfile
-import textwrap
-import time
-from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 
-from helpers.commands import heed_ctrl_c
 from helpers.faulty_robots import with_joint
 from helpers.resets import homes, reset_envs, state
 from helpers.robots import arm, finger
@@ -36,8 +26,8 @@ pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 import pybullet
 
 from morphgen.tasks.sim import bullet
-from morphgen.tasks.sim.bullet import BulletSimulation, divide
-from morphgen.tasks.sim.bullet_batch import FRICTION, OVERSPEED, SLACK, MotorForces
+from morphgen.tasks.sim.bullet import BulletSimulation
+from morphgen.tasks.sim.bullet_scene import FRICTION, OVERSPEED, SLACK, MotorForces
 
 PUSHING = (0.0, -0.2, 0.62, np.pi / 2, 0.0)
 """The gantry's plate upright behind the block, off the ground."""
@@ -57,7 +47,7 @@ def reset(simulation, q=None, pose=None, envs=None):
 
 
 def client_of(simulation, env=0):
-    return simulation.batch._loaded[env]
+    return simulation._loaded[env]
 
 
 def wander(simulation, q, steps, seed=0, size=0.03, ahead=0.0):
@@ -131,14 +121,6 @@ def test_client_limit_error_names_the_limit(monkeypatch):
     monkeypatch.setattr(pybullet, "connect", lambda *_: -1)
     with pytest.raises(SimulationError, match="no client left: a process has 1024"):
         BulletSimulation([push_scene()])
-
-
-def test_closing_frees_the_clients(simulate):
-    simulation = simulate(push_scene())
-    client = client_of(simulation).id
-    assert pybullet.isConnected(client)
-    simulation.close()
-    assert not pybullet.isConnected(client)
 
 
 @pytest.mark.parametrize("request_", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand"])
@@ -270,95 +252,25 @@ def test_links_collide_unless_their_pair_is_ignored(simulate):
     assert self_contact(simulate, body, scene=False) == touched
 
 
-TESTS = Path(__file__).parents[1]
-
-
-@pytest.fixture(scope="module")
-def workers():
-    simulation = BulletSimulation([*mixed_scenes(), *mixed_scenes()[:2]], processes=3)
-    yield simulation
-    simulation.close()
-
-
-def keep_stepping(simulation, q):
-    while True:
-        simulation.step(q)
-
-
-def is_running(pid):
-    """Return whether a process runs and is not a zombie."""
-    try:
-        status = Path(f"/proc/{pid}/stat").read_text()
-    except FileNotFoundError:
-        return False
-    return status.rpartition(")")[2].split()[0] != "Z"
-
-
-def eventually(condition, seconds=5.0):
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if condition():
-            return True
-        time.sleep(0.02)
-    return False
-
-
-def pids(simulation):
-    return [worker.process.pid for worker in simulation.workers]
-
-
 @pytest.fixture
 def scratch(tmp_path, monkeypatch):
-    """Folder for temporary files of this test and its processes."""
-    folder = tmp_path / "scratch"
-    folder.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    monkeypatch.setenv("TMPDIR", str(folder))
-    return folder
+    """Folder for temporary files of this test."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return tmp_path
 
 
-def leftovers(scratch, pid):
-    """Return temporary folders and shared memory left behind by a simulation."""
-    return [*scratch.glob("morphgen-*"), *Path("/dev/shm").glob(f"*{pid}*")]
-
-
-def test_workers_are_bit_identical_to_one_process(workers):
-    alone = BulletSimulation(workers.scenes)
-    generator = torch.Generator().manual_seed(0)
-    q = reset(alone)
-    assert torch.equal(reset(workers), q)
-    assert torch.equal(state(workers), state(alone))
-    for step in range(40):
-        q = q + 0.03 * torch.randn(q.shape, generator=generator)
-        for simulation in (alone, workers):
-            simulation.step(q)
-            if step == 20:
-                reset(simulation, envs=torch.tensor([1, 2, 3]))
-        assert torch.equal(state(workers), state(alone)), step
-    alone.close()
-
-
-@pytest.mark.parametrize("heavy", [{0}, {1}, {0, 1}], ids=["here", "in a worker", "both"])
-def test_diverged_environments_are_reported_and_the_others_step(heavy):
+def test_diverged_environments_are_reported_and_the_others_step(simulate):
     """The block's weight is not finite."""
-    scenes = [push_scene() for _ in range(4)]
-    for env in heavy:
-        scenes[env] = Scene(push_scene().robot, object=Block((0.1, 0.1, 0.1), mass=1e308))
-    with closing(BulletSimulation(scenes, processes=2)) as simulation:
-        assert [share.tolist() for share in simulation._shares] == [[0, 2], [1, 3]]
-        q = reset(simulation)
-        others = sorted({0, 1, 2, 3} - heavy)
-        before = state(simulation)[others]
-        message = rf"environment {min(heavy)} \(robot 'prims'\): diverged in step 1: q"
-        assert simulation.step(q).tolist() == [env in heavy for env in range(4)]
-        assert simulation.faults().keys() == heavy
-        assert re.match(message, simulation.faults()[min(heavy)])
-        assert (state(simulation)[others] != before).any(dim=1).all()
-        reset(simulation)
-        assert torch.isfinite(state(simulation)).all()
+    heavy = Scene(push_scene().robot, object=Block((0.1, 0.1, 0.1), mass=1e308))
+    simulation = simulate(heavy, push_scene(), heavy)
+    q, before = reset(simulation), state(simulation)[1]
+    assert simulation.step(q).tolist() == [True, False, True]
+    assert (state(simulation)[1] != before).any()
+    reset(simulation)
+    assert torch.isfinite(state(simulation)).all()
 
 
-def test_robot_that_cannot_be_loaded_is_named_in_the_parent(monkeypatch, scratch):
+def test_robot_that_cannot_be_loaded_is_named(monkeypatch, scratch):
     original = bullet.export_scenes
 
     def lost(scenes, folder):
@@ -368,111 +280,20 @@ def test_robot_that_cannot_be_loaded_is_named_in_the_parent(monkeypatch, scratch
     monkeypatch.setattr(bullet, "export_scenes", lost)
     with pytest.raises(SimulationError, match="robot 'prims': PyBullet cannot load it"):
         BulletSimulation([push_scene()])
-    assert leftovers(scratch, os.getpid()) == []
-
-
-def test_killed_worker_is_reported_and_everything_is_freed(scratch):
-    simulation = BulletSimulation([push_scene(), push_scene()], processes=2)
-    q = reset(simulation)
-    simulation.step(q)
-    running = pids(simulation)
-    os.kill(running[0], signal.SIGKILL)
-    with pytest.raises(SimulationError, match=r"worker 1 .* died \(exit code -9\)"):
-        keep_stepping(simulation, q)
-    assert not any(map(is_running, running))
-    assert leftovers(scratch, os.getpid()) == []
-    with pytest.raises(SimulationError, match="closed"):
-        simulation.step(q)
-    simulation.close()
+    assert [*scratch.iterdir()] == []
 
 
 @pytest.mark.parametrize("closes", [True, False], ids=["closed", "garbage-collected"])
 def test_nothing_is_left_of_a_simulation(scratch, closes):
-    simulation = BulletSimulation([push_scene(), push_scene()], processes=2)
-    running = pids(simulation)
+    simulation = BulletSimulation([push_scene(), push_scene()])
+    clients = [client_of(simulation, env).id for env in range(2)]
     if closes:
         simulation.close()
         simulation.close()
-        with pytest.raises(SimulationError, match="closed"):
-            reset(simulation)
     del simulation
     gc.collect()
-    assert not any(map(is_running, running))
-    assert leftovers(scratch, os.getpid()) == []
-
-
-SCRIPT = """
-import sys
-
-def main():
-    sys.path[:0] = [sys.argv[1], sys.argv[1] + "/tasks"]
-    from helpers.scenes import push_scene
-    from test_bullet import pids, reset
-    from morphgen.tasks.sim.bullet import BulletSimulation
-
-    simulation = BulletSimulation([push_scene(), push_scene(), push_scene()], processes=3)
-    q = reset(simulation)
-    print(*pids(simulation), flush=True)
-"""
-MAIN = """
-if __name__ == "__main__":
-    main()
-"""
-
-
-def script(tmp_path, ending):
-    """Start a process that simulates with two workers and writes their process ids."""
-    path = tmp_path / "script.py"
-    path.write_text(SCRIPT + textwrap.indent(textwrap.dedent(ending), " " * 4) + MAIN)
-    process = subprocess.Popen(
-        [sys.executable, str(path), str(TESTS)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        preexec_fn=heed_ctrl_c,
-    )
-    return process, [int(word) for word in process.stdout.readline().split()]
-
-
-FOREVER = """
-while True:
-    simulation.step(q)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("ending", "stop", "says"),
-    [
-        ("raise RuntimeError('on purpose')", None, "on purpose"),
-        (FOREVER, lambda pid: os.killpg(pid, signal.SIGINT), "KeyboardInterrupt"),  # as a terminal
-        (FOREVER.replace("simulation.step(q)", "pass"), lambda pid: os.killpg(pid, 2), "Keyboard"),
-        (FOREVER, lambda pid: os.kill(pid, signal.SIGKILL), ""),
-    ],
-    ids=["exception", "Ctrl-C", "Ctrl-C while idle", "killed"],
-)
-def test_workers_end_with_the_parent(tmp_path, scratch, ending, stop, says):
-    process, running = script(tmp_path, ending)
-    if stop is not None:
-        time.sleep(0.3)
-        stop(process.pid)
-    _, errors = process.communicate(timeout=20)
-    assert says in errors
-    assert errors.count("Traceback") == bool(says)
-    assert len(running) == 2
-    assert eventually(lambda: not any(map(is_running, running)))
-    assert not says or leftovers(scratch, process.pid) == []  # a killed process leaves its files
-    assert list(Path("/dev/shm").glob(f"*{process.pid}*")) == []
-
-
-def test_environments_are_distributed_evenly():
-    scenes = [scene for scene in mixed_scenes() for _ in range(10)]
-    shares = divide(scenes, 3)
-    assert sorted(env for share in shares for env in share) == list(range(30))
-    loads = [sum(5 + len(scenes[env].robot.movable_joints) for env in share) for share in shares]
-    assert max(loads) - min(loads) <= 14
-    assert divide(scenes[:2], 5) == [[0], [1]]
+    assert not any(map(pybullet.isConnected, clients))
+    assert [*scratch.iterdir()] == []
 
 
 def limits(body, error, velocity=0.0, effort=1e9):

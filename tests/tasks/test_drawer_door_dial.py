@@ -41,7 +41,7 @@ def pushed(name, *objects):
     simulation.reset(torch.ones(len(scenes), dtype=torch.bool), near, simulation.object_pose)
     for step in range(80):
         target = near + min(step / 65, 1.0) * 0.26
-        assert not simulation.step(target).any(), simulation.faults()
+        assert not simulation.step(target).any()
     positions = ObjectJoints(objects).positions(simulation.object_pose.double().numpy())
     rods = simulation.q[:, 0].numpy().copy()
     simulation.close()

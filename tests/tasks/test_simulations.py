@@ -1,7 +1,6 @@
 """Simulators: what all have in common, and MuJoCo."""
 
 import math
-import re
 from dataclasses import replace
 from functools import partial
 
@@ -98,7 +97,7 @@ def break_physics(sim, env):
     else:
         import pybullet
 
-        at = sim.batch._loaded[env]
+        at = sim._loaded[env]
         pybullet.resetJointState(at.robot, at.driven[0], math.nan, physicsClientId=at.id)
 
 
@@ -224,13 +223,10 @@ def test_a_diverged_environment_is_reported_and_a_reset_repairs_it(load, scenes)
     break_physics(sim, 2)
     whole.step(q)
     assert sim.step(q).tolist() == [False, False, True]
-    assert list(sim.faults()) == [2]
-    assert re.match(r"environment 2 \(.*'ur5-plane'.*diverged", sim.faults()[2])
     assert torch.equal(state(sim)[:2], state(whole)[:2])
     put_home(sim, [2])
     put_home(whole, [2])
     assert not sim.step(q + 0.01).any()
-    assert sim.faults() == {}
     whole.step(q + 0.01)
     assert torch.equal(state(sim), state(whole))
 
@@ -497,24 +493,18 @@ def test_results_are_bit_identical_for_any_thread_count():
         batch.close()
 
 
-def test_divergence_leaves_no_log_and_names_the_step(tmp_path, monkeypatch):
+def test_divergence_leaves_no_log(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     sim = MujocoSimulation(mixed_scenes(), threads=2)
     home = sim.q.clone()
     sim.step(home)
     sim._data[0].qvel[:] = sim._data[2].qvel[:] = 1e6
     assert sim.step(home).tolist() == [True, False, True]
-    where = rf"environment 0 \(robot '{sim.scenes[0].robot.name}'\)"
-    assert re.match(where + ": .* in step 2: .*beyond 10000", sim.faults()[0])
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("memory", "words"),
-    [(10_750, "its contacts do not fit into MuJoCo's memory"), (14_000, "stack overflow")],
-    ids=["contacts", "stack"],
-)
-def test_contact_overflow_affects_only_its_environment(monkeypatch, memory, words):
+@pytest.mark.parametrize("memory", [10_750, 14_000], ids=["contacts", "stack"])
+def test_contact_overflow_affects_only_its_environment(monkeypatch, memory):
     compiled = mujoco_model._robot_spec
 
     def cramped(*args):
@@ -528,9 +518,6 @@ def test_contact_overflow_affects_only_its_environment(monkeypatch, memory, word
     inside[1, :3] = torch.tensor([0.5, 0.2, 0.02])  # in an obstacle and the ground
     reset_envs(sim, [0, 1], q, inside)
     assert sim.step(q).tolist() == [False, True]
-    (fault,) = sim.faults().values()
-    assert re.match(rf"environment 1 \(robot 'prims'.*{words}", fault)
-    assert "\n" not in fault
     put_home(sim)
     held(sim, 3)
     alone = held(MujocoSimulation([push_scene()]), 3)
@@ -752,7 +739,7 @@ def movable_q(simulation):
     """Return the positions of all movable joints, mimic joints included."""
     if isinstance(simulation, MujocoSimulation):
         return simulation._data[0].qpos[simulation._worlds[0].movable_q_at].copy()
-    return simulation.batch._positions.copy()
+    return simulation._positions.copy()
 
 
 def in_environment(simulation, targets):

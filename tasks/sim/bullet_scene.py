@@ -1,33 +1,24 @@
-"""Scenes in PyBullet that step one after the other, in this process and in workers.
-
-It loads no torch, which would cost every worker seconds and 200 MB.
-"""
+"""A scene in a client of PyBullet, and the forces of its motors."""
 
 from __future__ import annotations
 
 import math
-import multiprocessing
-import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morphgen.errors import MissingDependencyError, SimulationError
 from morphgen.formats.quiet import quiet
 from morphgen.model.dynamics import BANDWIDTH, actuation, movable_mass_matrix
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Robot
 from morphgen.model.tree import rigid_groups
-from morphgen.processes import sigint_blocked
 from morphgen.tasks.sim.articulated import ArticulatedObject
 from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
-from morphgen.tasks.sim.motor_law import GAIN, clamp, constant, farthest_targets, is_within
+from morphgen.tasks.sim.motor_law import GAIN, clamp, constant, farthest_targets
 from morphgen.tasks.sim.rigid_bodies import ground_contact_links
 from morphgen.typing import Array
 
@@ -63,7 +54,7 @@ articulated object."""
 
 
 _MOVABLE = (pybullet.JOINT_REVOLUTE, pybullet.JOINT_PRISMATIC)
-_FROM_BULLET, _TO_BULLET = [0, 1, 2, 6, 3, 4, 5], [0, 1, 2, 4, 5, 6, 3]
+FROM_BULLET, _TO_BULLET = [0, 1, 2, 6, 3, 4, 5], [0, 1, 2, 4, 5, 6, 3]
 """Columns of a pose in morphgen's order, and in PyBullet's, whose quaternions have w last."""
 
 
@@ -80,15 +71,6 @@ SLACK = 0.2
 """Additional motor force, as a fraction of the spring's plus the damper's force: the inertia
 differs away from home, and rotation about several axes takes some force."""
 _SLACK, _SPRING, _DAMPER = map(constant, (SLACK, BANDWIDTH**2, 2 * BANDWIDTH))
-_RESPONSE, _BANDWIDTH, _TWO = map(constant, (TIMESTEP * BANDWIDTH, BANDWIDTH, 2))
-_TIMESTEP, _SUBSTEPS, _PERIOD = map(constant, (TIMESTEP, SUBSTEPS, SUBSTEPS * TIMESTEP))
-
-
-def consecutive(indices: NDArray[np.intp]) -> NDArray[np.intp] | slice:
-    """Return indices as a slice if they are consecutive: they select the same, in less time."""
-    first = int(indices[0]) if len(indices) else 0
-    is_slice = np.array_equal(indices, np.arange(first, first + len(indices)))
-    return slice(first, first + len(indices)) if is_slice else indices
 
 
 def limited_speeds(robot: Robot) -> list[float]:
@@ -186,7 +168,7 @@ class BulletScene:
     the control law only where nothing else moves the joint: the v on the right already includes the
     step's gravity and Coriolis acceleration, of which kd removes only a part. So motors control the
     velocity during a control step, with no more force than a spring and a damper would exert;
-    ``BulletBatch`` computes the velocity, ``MotorForces`` the force. The robot carries its own
+    ``BulletSimulation`` computes the velocity, ``MotorForces`` the force. The robot carries its own
     weight: the world has no gravity, and the block's weight is an external force. One call makes
     all substeps; the motors act in each, but PyBullet computes their impulse limits with the time
     of the whole call, hence forces are divided by ``SUBSTEPS``. A mimic joint is a motor that
@@ -219,7 +201,7 @@ class BulletScene:
         if self.id < 0:
             raise SimulationError(
                 f"PyBullet has no client left: a process has {MAX_CLIENTS}, one for each "
-                "environment; use more worker processes or fewer environments"
+                "environment; use fewer environments"
             )
         self._client = {"physicsClientId": self.id}
         direct = pybullet.CONSTRAINT_SOLVER_LCP_DANTZIG
@@ -449,258 +431,3 @@ def _effort(robot: Robot, k: int) -> float:
     """Return the effort limit of a movable joint; a linkage that moves a mimic joint has none."""
     joint = robot.joints[k]
     return (joint.effort if joint.mimic is None else None) or UNLIMITED
-
-
-MAX_VELOCITY = 1e4
-"""Speed of joints and blocks [rad/s or m/s] and distance of blocks [m] that count as diverged."""
-MAX_POSITION = float(np.finfo(np.float32).max)
-"""Joint positions may be any finite number: continuous joints turn without end."""
-Float32 = NDArray[np.float32]
-State = tuple[Float32, Float32, Float32, Float32]
-"""Joint positions and velocities, poses and linear velocities of blocks, a row per scene."""
-
-
-@dataclass(frozen=True)
-class Share:
-    """Environments that one process simulates."""
-
-    scenes: Sequence[Scene]
-    contacts: Contacts  # pairs of things that collide
-    exported: Sequence[Exported]  # robot and object of each scene, as `export_scenes` wrote them
-    num_joints: int  # length of the rows of joints in all processes
-
-
-_FINAL_RESPONSE = constant(1 - (1 - VELOCITY_GAIN) ** SUBSTEPS)
-"""Fraction of a velocity change that motors have made at the end of a control step."""
-_MEAN_RESPONSE = constant(
-    1 - sum((1 - VELOCITY_GAIN) ** k for k in range(1, SUBSTEPS + 1)) / SUBSTEPS
-)
-"""Mean of that fraction over the physics steps of a control step."""
-
-
-class BulletBatch:
-    """Scenes that step one after the other; ``state`` is what they are in."""
-
-    def __init__(self, share: Share) -> None:
-        """Load every scene, its robot at zero."""
-        self._share, self._scenes = share, share.scenes
-        n = len(self._scenes)
-        self.state: State = (
-            *np.zeros((2, n, share.num_joints), np.float32),
-            np.zeros((n, 7), np.float32),
-            np.zeros((n, 3), np.float32),
-        )
-        self._diverged: set[int] = set()
-        self._obstacle_poses: list[list[list[float]] | None] = [None] * n
-        self._loaded: list[BulletScene] = []
-        try:
-            self._loaded.extend(map(self._load, range(n)))
-        except BaseException:
-            self.close()
-            raise
-        self._objects = [i for i, scene in enumerate(self._scenes) if scene.object is not None]
-        self._index_joints()
-        efforts = [effort for loaded in self._loaded for effort in loaded.efforts]
-        self._forces = MotorForces([scene.robot for scene in self._scenes], efforts)
-
-    def _load(self, i: int) -> BulletScene:
-        return BulletScene(self._scenes[i], self._share.exported[i], self._share.contacts)
-
-    def _index_joints(self) -> None:
-        """Index targets and states in flat arrays of all scenes' joints.
-
-        Every movable joint follows one independent joint, its leader, so its target is a product
-        and a sum; a matrix product may round differently in another batch.
-        """
-        width = self._share.num_joints
-        self._flat_q, self._flat_qd = self.state[0].reshape(-1), self.state[1].reshape(-1)
-        source: list[int] = []
-        gain: list[float] = []
-        offset: list[float] = []
-        fastest: list[float] = []
-        leaders: list[int] = []
-        independent: list[int] = []
-        sink: list[int] = []
-        self._spans: list[slice] = []
-        for i, scene in enumerate(self._scenes):
-            robot, start = scene.robot, len(offset)
-            matrix, shift = robot.mimic_map
-            self._spans.append(slice(start, start + len(shift)))
-            if robot.dof:
-                leader = np.abs(matrix).argmax(axis=1)  # a row has one number that is not zero
-                source.extend((i * width + leader).tolist())
-                gain.extend(matrix[np.arange(len(matrix)), leader].tolist())
-                rows = robot.independent_rows
-                leaders.extend(start + row for row in np.array(rows)[leader].tolist())
-            offset.extend(shift.tolist())
-            fastest.extend(limited_speeds(robot))
-            independent.extend(start + row for row in robot.independent_rows)
-            sink.extend(range(i * width, i * width + robot.dof))
-        self._source = consecutive(np.array(source, np.intp))
-        self._sink = consecutive(np.array(sink, np.intp))
-        self._gain, self._offset = np.array(gain), np.array(offset)
-        self._leaders = np.array(leaders, np.intp)
-        self._fastest = np.array(fastest)
-        self._independent = consecutive(np.array(independent, np.intp))
-        self._positions, self._velocities, self._measured = np.zeros((3, len(offset)))
-
-    def reset(
-        self,
-        rows: NDArray[np.int64],
-        q: Float32,
-        object_pose: Float32,
-        obstacle_poses: Float32 | None,
-    ) -> None:
-        """Put scenes at rest and clear their history; see ``Simulation.reset``."""
-        all_q, all_qd, poses, velocities = self.state
-        for row, (i, positions, pose) in enumerate(zip(rows.tolist(), q, object_pose, strict=True)):
-            scene, span = self._scenes[i], self._spans[i]
-            if obstacle_poses is not None:
-                count = len(scene.obstacles)
-                self._obstacle_poses[i] = obstacle_poses[row, :count].tolist()
-            if i in self._diverged:
-                self._loaded[i].close()  # numbers that are not finite stay in a client
-                self._loaded[i] = self._load(i)
-                self._diverged.remove(i)
-            loaded = self._loaded[i]
-            self._positions[span] = movable_positions(scene.robot, positions[: scene.robot.dof])
-            self._velocities[span], self._measured[span] = 0, 0
-            loaded.reset(self._positions[span].tolist(), pose.tolist(), self._obstacle_poses[i])
-            all_q[i], all_qd[i] = positions, 0
-            if scene.object is not None:
-                poses[i] = np.array(loaded.object_state()[:7])[_FROM_BULLET]
-                velocities[i] = 0
-
-    def step(self, targets: Array) -> dict[int, str]:
-        """Advance the scenes by one control step towards targets of the independent joints.
-
-        Return the state of each scene that diverged: not finite, or ``MAX_VELOCITY``.
-        """
-        desired = targets.reshape(-1)[self._source] * self._gain + self._offset
-        ends, last = self._undisturbed(desired)
-        mean = (ends - self._positions) / _PERIOD
-        commanded = self._measured + (mean - self._measured) / _MEAN_RESPONSE
-        commanded = clamp(commanded, self._fastest)
-        velocities: list[float] = commanded.tolist()
-        limits = self._forces.limits(
-            (desired - self._positions, desired - ends), (self._velocities, last)
-        )
-        forces: list[float] = (limits / _SUBSTEPS).tolist()
-        states: list[tuple[float, float]] = []
-        for loaded, span in zip(self._loaded, self._spans, strict=True):
-            loaded.step(velocities[span], forces[span])
-            states += loaded.joint_states()
-        self._positions = np.array([state[0] for state in states])
-        before, self._measured = self._measured, np.array([state[1] for state in states])
-        expected = before + (commanded - before) * _FINAL_RESPONSE
-        self._velocities = last + (self._measured - expected)
-        q, qd = self._positions[self._independent], self._measured[self._independent]
-        self._flat_q[self._sink], self._flat_qd[self._sink] = q, qd
-        is_sane = is_within(q, MAX_POSITION) and is_within(qd, MAX_VELOCITY)
-        if self._objects:
-            blocks = np.array([self._loaded[i].object_state() for i in self._objects])
-            self.state[2][self._objects] = blocks[:, _FROM_BULLET]
-            self.state[3][self._objects] = blocks[:, 7:10]
-            is_sane = is_sane and is_within(blocks, MAX_VELOCITY)
-        return {} if is_sane else self._find_diverged()
-
-    def _undisturbed(self, desired: Array) -> tuple[Array, Array]:
-        """Return positions and velocities at the end of a control step without disturbances.
-
-        Integrates the critically damped law of ``morphgen.model.dynamics`` in physics steps. Effort
-        limits and contacts are not modelled: they show in the velocity that is measured afterwards,
-        and carry over to the next step.
-        """
-        q, v = self._positions, self._velocities
-        fastest, slowest = self._fastest, -self._fastest
-        for _ in range(SUBSTEPS):
-            v = v + _RESPONSE * (_BANDWIDTH * (desired - q) - _TWO * v)
-            v = np.minimum(np.maximum(v, slowest), fastest)
-            q = q + _TIMESTEP * v
-        # Mimic joints follow where their leaders are: a leader at its effort limit is late.
-        return q[self._leaders] * self._gain + self._offset, v[self._leaders] * self._gain
-
-    def _find_diverged(self) -> dict[int, str]:
-        """Return the states of scenes that diverged."""
-        faults = {}
-        for i, (q, qd, pose, _) in enumerate(zip(*self.state, strict=True)):
-            block = np.array(self._loaded[i].object_state() if i in self._objects else [0.0])
-            joints = is_within(q, MAX_POSITION) and is_within(qd, MAX_VELOCITY)
-            if not (joints and is_within(block, MAX_VELOCITY)):
-                faults[i] = f"q {q.tolist()}, qd {qd.tolist()}, block {pose.tolist()}"
-        self._diverged = set(faults)
-        return faults
-
-    def close(self) -> None:
-        """Free every scene; a second call does nothing."""
-        for loaded in self._loaded:
-            loaded.close()
-
-
-_EXIT_CODE_WAIT = 0.5  # time for a worker whose pipe has ended to exit [s]
-_CONTEXT = multiprocessing.get_context("spawn")
-
-
-class Worker:
-    """A process that simulates a share of the environments, and answers each call in its pipe."""
-
-    def __init__(self, number: int, share: Share) -> None:
-        """Start the process, whose first answer says that it has loaded its share."""
-        self._pipe, worker_end = _CONTEXT.Pipe()
-        self.process = _CONTEXT.Process(
-            target=_serve, args=(worker_end, share), name=str(number), daemon=True
-        )
-        with sigint_blocked():
-            self.process.start()
-        worker_end.close()  # so that the worker's death ends the pipe
-        self._size = len(share.scenes)
-
-    def send(self, method: str, *args: object) -> None:
-        """Call a method of the worker's ``BulletBatch``; ``receive`` returns the answer."""
-        try:
-            self._pipe.send((method, args))
-        except OSError as error:
-            raise self._death() from error
-
-    def receive(self) -> tuple[dict[int, str] | None, State]:
-        """Wait for the answer to a call, and the state after it."""
-        try:
-            answer: tuple[dict[int, str] | None, State] | Exception = self._pipe.recv()
-        except (EOFError, OSError) as error:
-            raise self._death() from error
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
-
-    def end(self) -> None:
-        """Kill the process, which holds nothing that needs an orderly shutdown."""
-        self._pipe.close()
-        self.process.kill()
-        self.process.join()
-        self.process.close()
-
-    def _death(self) -> SimulationError:
-        """Return the error that reports that the process is dead, with its exit code."""
-        self.process.join(_EXIT_CODE_WAIT)
-        return SimulationError(
-            f"worker {self.process.name} of {self._size} environments died (exit code "
-            f"{self.process.exitcode}); the simulation is closed"
-        )
-
-
-def _serve(pipe: Connection, share: Share) -> None:
-    """Answer calls until the pipe ends; the parent handles Ctrl-C and closes the pipe."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        batch = BulletBatch(share)
-        pipe.send((None, batch.state))
-        while True:
-            method, args = pipe.recv()
-            pipe.send((getattr(batch, method)(*args), batch.state))
-    except (EOFError, ConnectionError):
-        return  # the parent has closed the pipe, or has died
-    except SimulationError as error:
-        pipe.send(error)
-    except BaseException as error:
-        pipe.send(SimulationError(f"a worker failed: {type(error).__name__}: {error}"))
-        raise
