@@ -196,7 +196,7 @@ def ee_task_table() -> str:
         seeds = max(len(row.seeds) for row in rows)
         columns = (pushing.get("train"), reaching.get("train"), pushing.get("test"))
         rates = [column.success.as_percent() if column else "" for column in columns]
-        score = f"{reaching['train'].mean:.1f}" if reaching else ""
+        score = f"{reaching['train'].score.value:.1f}" if reaching else ""
         lines.append([*_run_cells(agent, steps, seeds), rates[0], score, *rates[1:]])
     headers = ["agent", "transitions", "seeds", "MT, push", "MT, reach", "success", "ZS, push"]
     return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
@@ -306,7 +306,7 @@ def _line(agent: str, steps: int, note: str, row: ResultRow, with_scores: bool) 
             cells += [""] * (2 if with_scores else 1)
             continue
         success = sides[side].success.as_percent()
-        cells += [f"{sides[side].mean:.1f}", success] if with_scores else [success]
+        cells += [f"{sides[side].score.value:.1f}", success] if with_scores else [success]
     return cells
 
 

@@ -62,7 +62,7 @@ def test_the_docs_have_the_numbers_of_a_stored_study(command, copied, monkeypatc
     rows = json.loads((copied / study / "results.json").read_text("utf-8"))["rows"]
     means = {
         (row["split"], row["task"], row["method"]): {
-            f"{side['mean']:{'.1f' if row['task'] == 'reach' else '.0%'}}"
+            f"{side['score']['value']:{'.1f' if row['task'] == 'reach' else '.0%'}}"
             for side in row["sides"].values()
         }
         for row in rows

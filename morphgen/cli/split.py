@@ -385,13 +385,14 @@ def score(args: argparse.Namespace) -> int:
             "a release that has one (split release --scores)"
         )
     with status(args, "scoring"):
-        rows = scores.method_rows(submissions, random) + references.rows()
+        own = dict(zip(map(str, args.submissions), submissions, strict=True))
+        rows = scores.ranked([*scores.scored_rows(own, random), *references.rows()])
     smallest, lowest = scores.smallest_differences(rows), scores.floor([each for _, each in named])
     data: dict[str, Any] = {
         "split": split.name,
         "random": "release" if random else "submission",
         "warnings": warnings,
-        "rows": scores.ranking_data(scores.ranked(rows)),
+        "rows": scores.rows_data(rows),
         "smallest_differences": smallest,
         "floor": lowest,
     }
@@ -411,7 +412,7 @@ def score(args: argparse.Namespace) -> int:
     notes += [f"warning: {text}" for text in warnings]
     notes += [line for line, _ in replays]
     style = "github" if args.markdown else "simple"
-    opt.print_result(args, data, lambda: "\n".join([scores.ranking_table(rows, style), "", *notes]))
+    opt.print_result(args, data, lambda: "\n".join([scores.result_tables(rows, style), *notes]))
     return int(not all(agrees for _, agrees in replays))
 
 

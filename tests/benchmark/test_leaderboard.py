@@ -20,18 +20,15 @@ from helpers.submissions import (
 )
 from morphgen.benchmark.scores import results as results_module
 from morphgen.benchmark.scores.results import (
-    Row,
-    SideScore,
     collect_references,
     floor,
-    method_rows,
     random_scores,
     ranked,
-    ranking_data,
-    ranking_table,
     read_references,
     reference_files,
-    score_runs,
+    result_tables,
+    rows_data,
+    scored_rows,
     smallest_differences,
 )
 from morphgen.benchmark.scores.submission import (
@@ -43,7 +40,6 @@ from morphgen.benchmark.scores.submission import (
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import default_library
 from morphgen.rl.scores import (
-    Interval,
     smallest_rate_difference,
     stratified_mean_interval,
     success_interval,
@@ -53,7 +49,8 @@ LIBRARY = default_library()
 
 
 def score_submission(each, random=None):
-    return score_runs([each], random, "submission")
+    (row,) = scored_rows({"a": each}, random)
+    return row
 
 
 @pytest.fixture
@@ -70,9 +67,9 @@ def stored(folder, **submissions):
 
 def test_scores_are_computed_from_the_episodes():
     row = score_submission(submission())
-    assert (row.method, row.source, row.seeds, row.episodes) == ("ours", "submission", (0,), 4)
-    train, test = (row.sides[side, "reach"] for side in ("train", "test"))
-    assert (len(row.sides), train.robots, test.robots) == (2, 2, 1)
+    assert (row.method, row.source, row.seeds) == ("ours", "submission", (0,))
+    train, test = (row.sides[side] for side in ("train", "test"))
+    assert (len(row.sides), train.robots, test.robots, test.episodes) == (2, 2, 1, 4)
     relative = np.array([150, 151, 152, -1]) + 2
     assert (test.score.value, test.success) == (relative.mean(), success_interval(0.75, 4))
     assert test.score == stratified_mean_interval([relative])
@@ -80,19 +77,15 @@ def test_scores_are_computed_from_the_episodes():
     assert test.score.high - test.score.low > train.score.high - train.score.low > 0
 
 
-def test_seeds_of_a_method_are_one_row_and_another_run_of_a_seed_is_its_own():
-    second = data(successes=1) | {"training_seed": 1}
-    runs = [submission(second), submission()]
-    (one,) = method_rows(runs)
-    assert (one.seeds, one.sides["test", "reach"].episodes) == ((0, 1), 8)
-    assert one.sides["test", "reach"].success.value == 0.5
-    rows = method_rows([*runs, submission(data(near=9.0)), submission(data("other"))])
-    assert [each.seeds for each in rows] == [(1,), (0,), (0,), (0,)]
-    assert "0, 1" in ranking_table([one])
+def test_a_method_has_one_run_of_a_seed():
+    runs = {"a": submission(), "b": submission(data(near=9.0))}
+    with pytest.raises(BenchmarkError, match="b: the same run, seed and mode as a with other epis"):
+        scored_rows(runs)
 
 
 def test_the_floor_and_the_smallest_difference_are_computed():
-    (values,) = smallest_differences(method_rows([submission(), submission(data("other"))]))
+    rows = scored_rows({"a": submission(), "b": submission(data("other"))})
+    (values,) = smallest_differences(rows)
     assert (values["task"], values["episodes"]) == ("reach", 4)
     assert values["success"] == smallest_rate_difference(4)
     assert values["score"] == pytest.approx(
@@ -105,7 +98,7 @@ def test_the_floor_and_the_smallest_difference_are_computed():
 
 def test_the_random_scores_of_a_release_replace_those_of_a_submission():
     forged = changed("robots", TEST, "random_score", value=[-600.0] * 4)
-    assert score_submission(submission(forged)).sides["test", "reach"].score.value > 600
+    assert score_submission(submission(forged)).sides["test"].score.value > 600
     random = random_scores(submission())
     fair = score_submission(submission(forged), random)
     assert fair.sides == score_submission(submission()).sides
@@ -115,38 +108,18 @@ def test_every_random_episode_counts_alike_whatever_the_number_of_episodes():
     random = {(each.side, each.member.name): [-8.0, 0.0, 0.0, 0.0] for each in EXPECTED}
     for episodes in (4, 5, 8):
         each = submission(data(episodes=episodes))
-        score = score_submission(each, random).sides["test", "reach"].score.value
+        score = score_submission(each, random).sides["test"].score.value
         assert score == pytest.approx(np.mean(each.robots[TEST].score) + 2)
 
 
-def row(method, *sides):
-    scores = {
-        (side, task): SideScore(
-            robots, Interval(score, math.nan, math.nan), success_interval(rate, 34)
-        )
-        for side, task, robots, score, rate in sides
-    }
-    return Row(method, "submission", "", (), 34, scores)
-
-
 def test_rows_are_ranked_by_the_test_robots():
-    rows = [
-        row("low", ("test", "reach", 1, 10.0, 0.5), ("train", "reach", 9, 99.0, 1.0)),
-        row("high", ("test", "reach", 1, 20.0, 0.1)),
-        row("none", ("train", "reach", 9, 99.0, 1.0)),
-    ]
-    assert [each.method for each in ranked(rows)] == ["high", "low", "none"]
-    mixed = [
-        row("a", ("test", "reach", 1, 90.0, 0.5), ("test", "push", 3, 0.1, 0.1)),
-        row("b", ("test", "reach", 1, 10.0, 0.3), ("test", "push", 3, 0.9, 0.9)),
-    ]
-    assert [each.method for each in ranked(mixed)] == ["b", "a"]
-    # A baseline that can do one task only has a score, but no success rate over all robots.
-    partial = row("ik", ("test", "reach", 1, 200.0, 1.0))
-    assert [each.method for each in ranked([partial, *mixed])] == ["b", "a", "ik"]
-    header, _, first, *_ = ranking_table(rows).splitlines()
-    assert header.split()[:4] == ["rank", "method", "from", "seeds"]
-    assert first.split()[:6] == ["1", "high", "submission", "-", "20.0", "10%"]
+    train = data("train")
+    train["robots"] = train["robots"][:TEST]
+    files = {"low": data("low", near=9.0), "train": train, "high": data("high")}
+    rows = ranked(scored_rows({name: submission(each) for name, each in files.items()}))
+    assert [each.method for each in rows] == ["high", "low", "train"]
+    lines = result_tables(rows).splitlines()[4:]
+    assert [line.split()[0] for line in lines] == ["high", "low", "train"]
 
 
 def test_fine_tuned_policies_are_told_from_others(tmp_path, this_version):
@@ -156,8 +129,8 @@ def test_fine_tuned_policies_are_told_from_others(tmp_path, this_version):
     references = collect_references(paths, SPLIT, PROTOCOL, LIBRARY)
     names = {f"submissions/ours-{run}.json" for run in ("seed0", "fine-tuned-30000-seed0")}
     assert set(reference_files(references)) == {"scores.json", *names}
-    assert [each.label for each in references.rows()] == ["ours (fine-tuned 30,000)", "ours"]
-    assert "ours (fine-tuned 30,000)" in ranking_table(references.rows())
+    assert [each.finetuned for each in references.rows()] == [30_000, 0]
+    assert "ours (reference)" in result_tables(references.rows())
 
 
 def test_references_are_submissions_and_episodes_of_studies(tmp_path, this_version):
@@ -181,7 +154,7 @@ def test_references_are_submissions_and_episodes_of_studies(tmp_path, this_versi
     assert {each.source for each in rows} == {"reference"}
     runs = {("ours", (0,)), ("random", ()), ("random", (0,)), ("me-mlp", (3,))}
     assert {(each.method, each.seeds) for each in rows} == runs
-    assert json.loads(files["scores.json"])["rows"] == ranking_data(rows)
+    assert json.loads(files["scores.json"])["rows"] == rows_data(rows)
     assert read_references(tmp_path).rows() == []
     baseline["robots"] = baseline["robots"][TEST:]
     stored(tmp_path, random=baseline)

@@ -51,7 +51,8 @@ def test_a_row_has_all_seeds_of_a_method_and_the_difference_to_the_reference():
     for side, robots in (("train", row.sides["train"]), ("test", row.sides["test"])):
         trials = 8 * robots.robots
         assert robots.episodes == trials, side
-        assert robots.mean == pytest.approx(np.mean(scores))
+        assert robots.score.value == pytest.approx(np.mean(scores))
+        assert robots.score == mean_interval([[each] * robots.robots for each in scores])
         assert robots.iqm.low <= robots.iqm.value <= robots.iqm.high
         wilson = success_interval(7 / 8, trials)
         successes = [[[True] * 4] * robots.robots, [[True] * 3 + [False]] * robots.robots]
@@ -197,7 +198,7 @@ def test_a_row_may_have_the_means_of_episodes(tmp_path):
     assert submission.robots[0].diverged == (True, False, False, False)
     (result,) = result_rows({"a": submission})
     side = result.sides["train"]
-    assert (side.episodes, side.mean, side.success.value) == (4, 14.5, 0.75)
+    assert (side.episodes, side.score.value, side.success.value) == (4, 14.5, 0.75)
 
 
 def broken(text):

@@ -146,18 +146,20 @@ def test_submissions_are_recorded_scored_and_ranked(run, ok, small):
         rows = json.loads(run("split", "score", f"{name}.json", "--split", folder, "--json")[1])
         (row,) = rows["rows"]
         assert (row["method"], row["source"], row["mode"]) == (name, "submission", "")
-        (test, expected) = ({x["side"]: x for x in each}["test"] for each in (row["sides"], scores))
-        for key in ("score", "success", "low", "high"):
-            assert test[key] == pytest.approx(expected[key]), key
+        test, (expected,) = row["sides"]["test"], [x for x in scores if x["side"] == "test"]
+        found = {
+            **test["score"],
+            "value": test["success"]["value"],
+            "score": test["score"]["value"],
+        }
+        for key, name in (("score",) * 2, ("value", "success"), ("low",) * 2, ("high",) * 2):
+            assert found[key] == pytest.approx(expected[name]), name
     words = ("--scores", "random.json", "ik.json", "--version", "1.1.0")
     ok(*RELEASE, small, *few, *words)
     archive = "releases/mine-small-1.1.0.zip"
     out = ok("split", "score", "ik.json", "--split", archive)
-    assert [line.split()[1:3] for line in out.splitlines()[2:5]] == [
-        ["ik", "submission"],
-        ["ik", "reference"],
-        ["random", "reference"],
-    ]
+    names = [line.partition("  ")[0] for line in out.splitlines()[4:7]]
+    assert names == ["ik", "ik (reference)", "random (reference)"]
     assert "by the episodes of the release" in out
     brief = ("--steps", "64", "--envs", "4", "--set", "num_steps=16", "--set", "minibatches=4")
     words = ("--agent", "me-mlp", *brief, "--sim", "mujoco", "--out", "r")

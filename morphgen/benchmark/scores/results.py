@@ -1,8 +1,8 @@
-"""Results of submissions, computed from the episodes: rankings, reference scores, tables of seeds.
+"""Results of submissions, computed from the episodes: tables of seeds, and reference scores.
 
-Reference scores are those of submissions in a release. In tables, scores of several seeds of a
-method stand in one row, whose intervals resample the seeds: interquartile means, success rates, and
-paired differences to a reference controller.
+Scores of several seeds of a method stand in one row, whose intervals resample the seeds: means,
+interquartile means, success rates, and paired differences to a reference controller. Reference
+scores are those of submissions in a release.
 """
 
 from __future__ import annotations
@@ -62,104 +62,15 @@ from morphgen.typing import Array
 Source = Literal["submission", "reference"]
 
 
-@dataclass(frozen=True)
-class SideScore:
-    """Mean result over the robots of a side that do one task."""
-
-    robots: int
-    score: Interval  # mean score, relative to the random policy where the task wants it
-    success: Interval  # mean success rate, 0 to 1; see `seeds_success_interval`
-    episodes: int = 0  # number of episodes of all robots and seeds
-    error: float = math.nan  # standard error of the score; see `mean_error`
-
-    def as_data(self) -> dict[str, Any]:
-        """Return JSON values, with null for ends of intervals that are not known."""
-        score, success = self.score, self.success
-        values = {"robots": self.robots, "score": score.value, "success": success.value}
-        values |= {"episodes": self.episodes, "error": self.error}
-        values |= {"low": score.low, "high": score.high}
-        values |= {"success_low": success.low, "success_high": success.high}
-        return dict(finite_or_none(values))
-
-
-@dataclass(frozen=True)
-class Row:
-    """A method in a ranking."""
-
-    method: str
-    source: Source  # `submission`; or `reference`, a submission in a release
-    mode: str
-    seeds: tuple[int, ...]  # seeds of the training; empty for a baseline
-    episodes: int  # episodes per robot
-    sides: Mapping[tuple[Side, str], SideScore]  # by side and task
-    finetuned: int = 0  # transitions of fine-tuning on the test robots
-
-    @property
-    def label(self) -> str:
-        """Method, and how the policy acts and was fine-tuned if that is not the usual way."""
-        remarks = ["stochastic"] if self.mode == "stochastic" else []
-        if self.finetuned:
-            remarks.append(f"fine-tuned {self.finetuned:,}")
-        return f"{self.method} ({', '.join(remarks)})" if remarks else self.method
-
-
-def method_rows(
-    submissions: Sequence[Submission],
-    random: RandomScores | None = None,
-    source: Source = "submission",
-) -> list[Row]:
-    """Return a row for each method, or for each of several policies with one name and seed."""
-    groups: dict[Any, list[Submission]] = {}
-    for each in submissions:
-        robots = frozenset((robot.side, robot.robot) for robot in each.robots)
-        groups.setdefault((_key(each), each.training_seed is None, robots), []).append(each)
-    rows = []
-    for own in groups.values():
-        are_seeds = len({each.training_seed for each in own}) == len(own)
-        for runs in [own] if are_seeds else [[each] for each in own]:
-            rows.append(score_runs(runs, random, source))
-    return rows
-
-
-def score_runs(runs: Sequence[Submission], random: RandomScores | None, source: Source) -> Row:
-    """Compute the scores of the runs of a method, one for each training seed."""
-    first, *_ = runs
-    sides = {}
-    for side, task in ((side, task) for side in SIDES for task in TASKS):
-        tables = [_outcomes(run, side, task) for run in runs]
-        robots = list(tables[0])
-        if not robots:
-            continue
-        scores = [[relative_scores(table[name], random) for name in robots] for table in tables]
-        successes = [[table[name].success for name in robots] for table in tables]
-        sides[side, task] = SideScore(
-            len(robots),
-            episode_interval(scores, successes, relative=TASKS[task].relative_to_random),
-            seeds_success_interval(successes),
-            sum(map(len, itertools.chain(*successes))),
-            mean_error(scores),
-        )
-    return Row(
-        first.method,
-        source,
-        first.mode,
-        tuple(sorted(run.training_seed for run in runs if run.training_seed is not None)),
-        min(len(each.score) for run in runs for each in run.robots),
-        sides,
-        first.finetuned,
-    )
-
-
-def smallest_differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
+def smallest_differences(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
     """Return the smallest differences that the test episodes of any two rows show, by task.
 
     ``success`` is that of two rates around 50%, from the row with the fewest episodes; ``score``
     that of the rows with the largest standard errors, None if one is not known.
     """
-    tasks = {task for row in rows for side, task in row.sides if side == "test"}
     found = []
-    for task in sorted(tasks):
-        own = [row.sides["test", task] for row in rows if ("test", task) in row.sides]
+    for task in sorted({row.task for row in rows if "test" in row.sides}):
+        own = [row.sides["test"] for row in rows if row.task == task and "test" in row.sides]
         episodes = min(side.episodes for side in own)
         errors = np.sort([side.error for side in own])  # nan last
         largest = float(errors[-1]), float(errors[-min(2, len(errors))])
@@ -187,69 +98,16 @@ def random_scores(submission: Submission) -> RandomScores:
     return {(each.side, each.robot): each.random_score for each in submission.robots}
 
 
-def ranked(rows: Sequence[Row]) -> list[Row]:
-    """Return rows by their mean score on the test robots, the best first.
+def ranked(rows: Sequence[ResultRow]) -> list[ResultRow]:
+    """Return rows by their mean score on the test robots, the best first; others come last."""
 
-    Scores of different tasks cannot be added: with several it is the success rate. Rows without all
-    of these tasks come last.
-    """
-    tasks = {task for row in rows for side, task in row.sides if side == "test"}
-
-    def result(row: Row) -> float:
-        test = [score for (side, _), score in row.sides.items() if side == "test"]
-        if not test or len(test) < len(tasks):
-            return -math.inf
-        if len(tasks) == 1:
-            return test[0].score.value
-        robots = sum(side.robots for side in test)
-        return sum(side.success.value * side.robots for side in test) / robots
+    def result(row: ResultRow) -> float:
+        return row.sides["test"].score.value if "test" in row.sides else -math.inf
 
     return sorted(rows, key=result, reverse=True)
 
 
-def ranking_table(rows: Sequence[Row], style: str = "simple") -> str:
-    """Return the ranking as a table; ``style`` is one of tabulate's."""
-    pairs = {pair for row in rows for pair in row.sides}
-    groups = sorted(pairs, key=lambda pair: (pair[0] != "test", pair[1]))
-    headers = ["rank", "method", "from", "seeds"]
-    for side, task in groups:
-        headers += [f"{SIDE_NAMES[side]} {task}", "95%", "success"]
-    decimals = {}
-    for group in groups:
-        scores = [row.sides[group].score.value for row in rows if group in row.sides]
-        decimals[group] = score_decimals(scores)
-    lines = []
-    for rank, row in enumerate(ranked(rows), 1):
-        cells = [str(rank), row.label, row.source, ", ".join(map(str, row.seeds)) or "-"]
-        for group in groups:
-            cells += _cells(row.sides.get(group), decimals[group])
-        lines.append([*cells, str(row.episodes)])
-    return table(lines, [*headers, "episodes"], style=style, last=("from", "seeds"))
-
-
-def ranking_data(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return the rows for JSON, in their order."""
-    return [
-        {
-            **vars(row),
-            "seeds": list(row.seeds),
-            "sides": [
-                {"side": side, "task": task, **score.as_data()}
-                for (side, task), score in row.sides.items()
-            ],
-        }
-        for row in rows
-    ]
-
-
-def _cells(side: SideScore | None, decimals: int) -> list[str]:
-    if side is None:
-        return ["-", "", ""]
-    form = f".{decimals}f"
-    return [f"{side.score.value:{form}}", side.score.ends(form), side.success.as_percent()]
-
-
-FORMAT = 2
+FORMAT = 3
 RANDOM = "random"  # method whose episodes all scores of a release are relative to
 
 
@@ -265,9 +123,10 @@ class References:
         baselines = (each for each in self.submissions if _is_baseline(each, RANDOM))
         return next(map(random_scores, baselines), None)
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[ResultRow]:
         """Return the scores of the submissions."""
-        return method_rows(self.submissions, self.random, "reference")
+        named = {_path(each): each for each in self.submissions}
+        return scored_rows(named, self.random, "reference")
 
 
 def collect_references(
@@ -303,7 +162,7 @@ def collect_references(
 def reference_files(references: References) -> dict[str, bytes]:
     """Return the files of a release with reference scores, by path."""
     files = {_path(each): submission_text(each).encode() for each in references.submissions}
-    data = {"format": FORMAT, "rows": ranking_data(references.rows())}
+    data = {"format": FORMAT, "rows": rows_data(references.rows())}
     return files | {SCORES_FILE: (json.dumps(data, indent=2) + "\n").encode()}
 
 
@@ -350,7 +209,8 @@ class SideResult:
 
     robots: int
     episodes: int  # number of episodes of all robots and seeds
-    mean: float  # mean score over seeds and robots
+    score: Interval  # mean score over seeds and robots; see `episode_interval`
+    error: float  # standard error of the mean score; see `mean_error`
     iqm: Interval  # interquartile mean of the scores of seeds and robots; no interval for one seed
     success: Interval  # mean success rate; see `seeds_success_interval`
     difference: Interval | None
@@ -372,6 +232,7 @@ class ResultRow:
     simulator: str  # simulator of the training; empty like `transitions`
     seeds: tuple[int, ...]  # seeds of the training
     sides: Mapping[Side, SideResult]
+    source: Source = "submission"
 
 
 def result_rows(submissions: Mapping[str, Submission]) -> list[ResultRow]:
@@ -384,23 +245,44 @@ def result_rows(submissions: Mapping[str, Submission]) -> list[ResultRow]:
         require_comparable(own)
         _require_shipped_robots(split, own)
         require_same_random(list(own.items()))
-        groups: dict[_Key, dict[int | None, tuple[str, Submission]]] = {}
-        for where, each in own.items():
-            group = groups.setdefault(_key(each), {})
-            earlier, other = group.setdefault(each.training_seed, (where, each))
-            if each.robots != other.robots:  # several studies may have the same run of a baseline
-                raise BenchmarkError(
-                    f"{where}: the same run, seed and mode as {earlier} with other episodes; name "
-                    "one of the two files"
-                )
-        for task in dict.fromkeys(robot.task for each in own.values() for robot in each.robots):
-            baseline = groups.get((REFERENCES.get(task, ""), "", 0, None, ""), {})
-            _, reference = baseline.get(None, ("", None))
-            for key, group in groups.items():
-                sides = dict(_side_results([run for _, run in group.values()], task, reference))
-                seeds = tuple(sorted(seed for seed in group if seed is not None))
-                if sides:
-                    rows.append(ResultRow(split, task, *key, seeds, sides))
+        rows += scored_rows(own, with_differences=True)
+    return rows
+
+
+def scored_rows(
+    submissions: Mapping[str, Submission],
+    random: RandomScores | None = None,
+    source: Source = "submission",
+    *,
+    with_differences: bool = False,
+) -> list[ResultRow]:
+    """Return the rows of submissions to one split, which were checked.
+
+    Args:
+        submissions: Submissions by the name of their file.
+        random: Scores of the random policy; by default those that a submission has.
+        source: Where the submissions come from.
+        with_differences: Whether to compare each with the reference of its task.
+    """
+    groups: dict[_Key, dict[int | None, tuple[str, Submission]]] = {}
+    for where, each in submissions.items():
+        group = groups.setdefault(_key(each), {})
+        earlier, other = group.setdefault(each.training_seed, (where, each))
+        if each.robots != other.robots:  # several studies may have the same run of a baseline
+            raise BenchmarkError(
+                f"{where}: the same run, seed and mode as {earlier} with other episodes; name "
+                "one of the two files, or their methods differently"
+            )
+    rows = []
+    for task in dict.fromkeys(robot.task for each in submissions.values() for robot in each.robots):
+        baseline = groups.get((REFERENCES.get(task, ""), "", 0, None, ""), {})
+        _, reference = baseline.get(None, ("", None)) if with_differences else ("", None)
+        for key, group in groups.items():
+            runs = [run for _, run in group.values()]
+            sides = dict(_side_results(runs, task, reference, random))
+            seeds = tuple(sorted(seed for seed in group if seed is not None))
+            if sides:
+                rows.append(ResultRow(runs[0].split.name, task, *key, seeds, sides, source))
     return rows
 
 
@@ -436,7 +318,10 @@ def _require_shipped_robots(split: str, submissions: Mapping[str, Submission]) -
 
 
 def _side_results(
-    runs: Sequence[Submission], task: str, reference: Submission | None
+    runs: Sequence[Submission],
+    task: str,
+    reference: Submission | None,
+    random: RandomScores | None,
 ) -> Iterator[tuple[Side, SideResult]]:
     for side in SIDES:
         tables = [_outcomes(run, side, task) for run in runs]
@@ -449,9 +334,8 @@ def _side_results(
                 "expected the same robots in all"
             )
         robots = [name for name in tables[0] if name in names]
-        scores = np.array(
-            [[relative_scores(table[name]).mean() for name in robots] for table in tables]
-        )
+        scores = [[relative_scores(table[name], random) for name in robots] for table in tables]
+        means = np.array([[each.mean() for each in own] for own in scores])
         # Policies of single robots are independent samples on the robots that they learned.
         together = not any(_learned_alone(run, side) for run in runs)
         successes = [[table[name].success for name in robots] for table in tables]
@@ -460,8 +344,9 @@ def _side_results(
             SideResult(
                 len(robots),
                 sum(map(len, itertools.chain(*successes))),
-                float(scores.mean()),
-                iqm_interval(scores, together=together),
+                episode_interval(scores, successes, relative=TASKS[task].relative_to_random),
+                mean_error(scores),
+                iqm_interval(means, together=together),
                 seeds_success_interval(successes, together=together),
                 _difference(
                     tables,
@@ -529,7 +414,7 @@ def result_tables(rows: Sequence[ResultRow], style: str = "simple") -> str:
         for side in SIDES:
             name = SIDE_NAMES[side]
             headers += [f"{name} mean", f"{name} IQM", f"{name} success", reference]
-        decimals = score_decimals(side.mean for row in own for side in row.sides.values())
+        decimals = score_decimals(side.score.value for row in own for side in row.sides.values())
         lines = [_line(row, decimals) for row in own]
         title = split if split.endswith(f"/{task}") else f"{split}: {task}"
         text = table(lines, headers, style=style, last=[reference, *_LESS])
@@ -539,7 +424,9 @@ def result_tables(rows: Sequence[ResultRow], style: str = "simple") -> str:
 
 def _line(row: ResultRow, decimals: int) -> list[str]:
     trained = "-" if row.transitions is None else f"{row.transitions:,} {row.simulator}"
-    name = f"{row.method} ({row.mode})" if row.mode == "stochastic" else row.method
+    remarks = ["stochastic"] * (row.mode == "stochastic")
+    remarks += ["reference"] * (row.source == "reference")
+    name = f"{row.method} ({', '.join(remarks)})" if remarks else row.method
     tuned = f"{row.finetuned:,}" if row.finetuned else "-"
     line = [name, str(len(row.seeds) or "-"), trained, tuned]
     for side in SIDES:
@@ -548,7 +435,7 @@ def _line(row: ResultRow, decimals: int) -> list[str]:
             line += ["-"] * 4
             continue
         line += [
-            f"{result.mean:.{decimals}f}",
+            result.score.as_text(f".{decimals}f"),
             result.iqm.as_text(f".{decimals}f"),
             result.success.as_percent(),
             "-" if result.difference is None else result.difference.as_text(f"+.{decimals}f"),
