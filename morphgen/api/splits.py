@@ -28,7 +28,6 @@ from morphgen.benchmark.split_folder import (
     read_split_or_folder,
 )
 from morphgen.benchmark.survey import statistics
-from morphgen.encoding.similarity import NEAR_THRESHOLDS, NearThresholds
 from morphgen.encoding.tokens import MAX_LINKS
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.extras import explain_missing_extras
@@ -121,23 +120,17 @@ class LoadedSplit:
         return statistics(self.definition, self.library, jobs=jobs)
 
     @explain_missing_extras()
-    def audit(
-        self,
-        *,
-        near: NearThresholds = NEAR_THRESHOLDS,
-        jobs: int = 1,
-    ) -> Audit:
+    def audit(self, *, jobs: int = 1) -> Audit:
         """Find leaks between train and test robots; see ``morphgen.benchmark.audit.audit``.
 
         Args:
-            near: Thresholds of near duplicates.
             jobs: Number of processes.
 
         Raises:
             BenchmarkError: If the provenance of the split is malformed.
             MissingDependencyError: If a part's primitives must be fitted, and ``fit`` is missing.
         """
-        return audit(self.definition, self.library, near=near, jobs=jobs)
+        return audit(self.definition, self.library, jobs=jobs)
 
     def write(self, path: str | PathLike[str] = ".") -> Path:
         """Write the split's file.

@@ -18,7 +18,7 @@ from morphgen.benchmark.survey import (
     nearest_train,
     survey_split,
 )
-from morphgen.encoding.similarity import NEAR_THRESHOLDS, NearThresholds, is_same_reach
+from morphgen.encoding.similarity import NEAR_THRESHOLDS, is_same_reach
 from morphgen.errors import nearest
 from morphgen.grammar.library import Library
 from morphgen.model.findings import Finding
@@ -56,21 +56,17 @@ class Audit:
         }
 
 
-def audit(
-    split: Split, library: Library, *, near: NearThresholds = NEAR_THRESHOLDS, jobs: int = 1
-) -> Audit:
+def audit(split: Split, library: Library, *, jobs: int = 1) -> Audit:
     """Find leaks between train and test robots, and violations of the regime (docs/splits.md)."""
-    return audit_survey(survey_split(split, library, jobs=jobs), library, near)
+    return audit_survey(survey_split(split, library, jobs=jobs), library)
 
 
-def audit_survey(
-    survey: SplitSurvey, library: Library, near: NearThresholds = NEAR_THRESHOLDS
-) -> Audit:
+def audit_survey(survey: SplitSurvey, library: Library) -> Audit:
     """Audit a split from its survey; see ``audit``."""
     split = survey.split
     findings = [
         *_robot_findings(survey),
-        *_leaks(survey, near),
+        *_leaks(survey),
         *_repeated(split),
         *_regime_findings(survey, library),
         *_unknown_tasks(split),
@@ -105,12 +101,12 @@ def _robot_findings(survey: SplitSurvey) -> Iterator[Finding]:
             yield found("body-changed", where, named=member.robot_hash, given=given)
 
 
-def _leaks(survey: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
+def _leaks(survey: SplitSurvey) -> Iterator[Finding]:
     """Yield test robots that are train robots, or near duplicates of them."""
-    split = survey.split
+    split, near = survey.split, NEAR_THRESHOLDS
     names = {member.name: member for member in split.train}
     tree, cosine, workspace = map(survey.by_measure, ("tree", "cosine", "workspace"))
-    is_one_workspace = _same_reach(survey, near) & (workspace > near.workspace)
+    is_one_workspace = _same_reach(survey) & (workspace > near.workspace)
     is_near = (tree < near.tree) & ((cosine > near.cosine) | is_one_workspace)
     for j, member in enumerate(split.test):
         where = f"test robot {member.name}"
@@ -132,14 +128,14 @@ def _leaks(survey: SplitSurvey, near: NearThresholds) -> Iterator[Finding]:
             yield found("name-shared", where)
 
 
-def _same_reach(survey: SplitSurvey, near: NearThresholds) -> NDArray[np.bool_]:
+def _same_reach(survey: SplitSurvey) -> NDArray[np.bool_]:
     """Return which pairs have nearly one reach, shape (n_train, n_test)."""
     n = len(survey.split.train)
     train, test = (
         np.array([each.workspace.reach if each else np.nan for each in known])
         for known in (survey.features[:n], survey.features[n:])
     )
-    return is_same_reach(train[:, None], test[None, :], near)
+    return is_same_reach(train[:, None], test[None, :])
 
 
 def _repeated(split: Split) -> Iterator[Finding]:

@@ -94,7 +94,10 @@ def describe(demos: Demonstrations) -> None:
     if (folder / SUMS_FILE).is_file():
         return
     parts = _licenced_parts(folder)
-    texts = {**licences.licence_files(parts), README_FILE: _card(demos, parts)}
+    texts = {
+        licences.LICENCES_FILE: licences.licences_json(parts),
+        README_FILE: _card(demos, parts),
+    }
     for name, text in texts.items():
         write_atomic(folder / name, text)
     write_atomic(folder / licences.CROISSANT_FILE, _croissant(demos, parts, folder_hashes(folder)))

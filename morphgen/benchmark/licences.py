@@ -22,7 +22,7 @@ from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.splits.split import SIDES, Split, sided_members
 
-LICENCES_FILE, LICENCES_TEXT = "licences.json", "LICENCES.md"
+LICENCES_FILE = "licences.json"
 CROISSANT_FILE = "croissant.json"
 
 UNKNOWN = "unknown"  # restriction of a licence that is not listed
@@ -172,35 +172,9 @@ def dataset_card(
     return f"---\n{head}---\n\n{text}"
 
 
-def licence_files(parts: Sequence[LicencedPart]) -> dict[str, str]:
-    """Return the texts of the files with all licences, for tools and for readers."""
-    data = json.dumps([part.as_dict() for part in parts], indent=2, ensure_ascii=False)
-    return {LICENCES_FILE: f"{data}\n", LICENCES_TEXT: licences_text(parts)}
-
-
-def licences_text(parts: Sequence[LicencedPart]) -> str:
-    """Return the text of ``LICENCES.md``."""
-    lines = ["# Licences", "", licence_summary(parts), ""]
-    for identifier in licence_ids(parts):
-        licence = find_licence(identifier)
-        limits = f" ({', '.join(licence.restrictions)})" if licence.restrictions else ""
-        heading = f"[{identifier}]({licence.url})" if licence.url else identifier
-        lines += [f"## {heading}{limits}", ""]
-        for part in parts:
-            if part.licence.id == identifier:
-                lines += _part_lines(part)
-        lines.append("")
-    return "\n".join(lines)
-
-
-def _part_lines(part: LicencedPart) -> list[str]:
-    robots = [
-        f"{side}: {', '.join(names)}"
-        for side in SIDES
-        if (names := [name for each, name in part.robots if each == side])
-    ]
-    source = [f"  - source: {' '.join(part.citation.split())}"] if part.citation else []
-    return [f"- **{part.part}**", *source, f"  - robots: {'; '.join(robots)}"]
+def licences_json(parts: Sequence[LicencedPart]) -> str:
+    """Return the text of ``licences.json``."""
+    return json.dumps([part.as_dict() for part in parts], indent=2, ensure_ascii=False) + "\n"
 
 
 def licence_summary(parts: Sequence[LicencedPart]) -> str:
@@ -212,7 +186,7 @@ def licence_summary(parts: Sequence[LicencedPart]) -> str:
     ]
     text = (
         f"The parts of the robots are under {', '.join(licence_ids(parts))}. "
-        f"`{LICENCES_TEXT}` lists parts, sources and robots."
+        f"`{LICENCES_FILE}` lists parts, sources and robots."
     )
     return "\n".join([text, *limits])
 

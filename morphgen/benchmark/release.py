@@ -3,7 +3,7 @@
 A release is a split folder (see ``split_folder``) with further files:
 
 release.json       version of the release, evaluation
-licences.json      every part with its licence and robots; LICENCES.md is the same for readers
+licences.json      every part with its licence and robots
 croissant.json     description of the dataset for tools (https://docs.mlcommons.org/croissant)
 scores.json        reference scores, if there are any
 submissions/       the reference submissions that the scores were computed from
@@ -390,7 +390,7 @@ def release_split(
         data = {key: value for key, value in data.items() if value not in ("", [], (), {})}
         texts = {
             RELEASE_FILE: json.dumps({"format": release.format, **data}, indent=2) + "\n",
-            **licences.licence_files(parts),
+            licences.LICENCES_FILE: licences.licences_json(parts),
         }
         files = {name: text.encode() for name, text in texts.items()} | dict(extra or {})
         known = [*read_sums(report.folder / SUMS_FILE), *files]

@@ -33,7 +33,7 @@ from morphgen.benchmark.scores.submission import (
 from morphgen.benchmark.survey import paper_row, statistics
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, status
-from morphgen.encoding.similarity import MEASURES, NEAR_THRESHOLDS, NearThresholds
+from morphgen.encoding.similarity import MEASURES
 from morphgen.errors import BenchmarkError
 from morphgen.formats.files import require_writable_folder
 from morphgen.model.findings import Finding
@@ -59,32 +59,13 @@ MAX_LISTED = 10  # largest number of findings of one code, or of differences, th
 
 def audit(args: argparse.Namespace) -> int:
     """Audit a split and print the findings."""
-    near, split = _near(args.near), open_split(args.split, library=args.library)
+    split = open_split(args.split, library=args.library)
     with bar(args, "auditing"):
-        result = split.audit(near=near, jobs=args.jobs)
+        result = split.audit(jobs=args.jobs)
     passed = result.passed(strict=args.strict)
     data = {**result.as_dict(), "passed": passed}
     opt.print_result(args, data, lambda: _audit_text(result, passed))
     return int(not passed)
-
-
-def _near(text: str | None) -> NearThresholds:
-    if text is None:
-        return NEAR_THRESHOLDS
-    try:
-        tree, cosine, *more = map(float, text.split(","))
-        near = NearThresholds(tree, cosine, *more)
-    except (ValueError, TypeError) as error:
-        raise BenchmarkError(
-            f"--near {text}: expected a tree distance and a cosine, such as 0.001,0.99999; a third "
-            "number is the workspace overlap"
-        ) from error
-    if not (0 <= tree <= 1 and -1 <= cosine <= 1 and 0 <= near.workspace <= 1):
-        raise BenchmarkError(
-            f"--near {text}: a tree distance is from 0 to 1, a cosine from -1 to 1, and a "
-            "workspace overlap from 0 to 1"
-        )
-    return near
 
 
 def _audit_text(result: Audit, passed: bool) -> str:

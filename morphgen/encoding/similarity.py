@@ -551,17 +551,16 @@ depends on neither, but its unit is the reach, so the reach is compared beside i
 """
 
 
-def is_near(a: Features, b: Features, near: NearThresholds = NEAR_THRESHOLDS) -> bool:
+def is_near(a: Features, b: Features) -> bool:
     """Return whether two robots are near duplicates."""
+    near = NEAR_THRESHOLDS
     is_alike = cosine(a, b) > near.cosine or bool(
-        is_same_reach(a.workspace.reach, b.workspace.reach, near)
+        is_same_reach(a.workspace.reach, b.workspace.reach)
         and workspace_overlap(a, b) > near.workspace
     )
     return is_alike and tree_distance(a, b) < near.tree  # the slowest measure comes last
 
 
-def is_same_reach(
-    a: ArrayLike, b: ArrayLike, near: NearThresholds = NEAR_THRESHOLDS
-) -> NDArray[np.bool_]:
+def is_same_reach(a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:
     """Return whether distances of the tool from the shoulder are nearly equal, elementwise."""
-    return np.abs(np.subtract(a, b)) < near.reach * np.maximum(a, b)
+    return np.abs(np.subtract(a, b)) < NEAR_THRESHOLDS.reach * np.maximum(a, b)

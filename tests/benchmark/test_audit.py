@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.splits import LIBRARY, TEST, TRAIN, combined, member, split
+from morphgen.benchmark import audit as audit_module
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.survey import (
     compare_members,
@@ -27,9 +28,9 @@ from morphgen.progress import show_progress
 from morphgen.splits.split_file import split_names
 
 
-def finding_keys(example_split, **options):
+def finding_keys(example_split):
     """Return code and location of every finding."""
-    return [(each.code, each.where) for each in audit(example_split, LIBRARY, **options).findings]
+    return [(each.code, each.where) for each in audit(example_split, LIBRARY).findings]
 
 
 NEAR = member(f"{TEST[0]} ee.size=100.1mm", "near")
@@ -74,7 +75,7 @@ def test_the_same_robot_with_another_task_is_not_a_leak():
     assert not codes & {"body-shared", "body-near"}
 
 
-def test_a_near_duplicate_needs_the_tree_and_another_measure():
+def test_a_near_duplicate_needs_the_tree_and_another_measure(monkeypatch):
     example_split = split([f"{TEST[0]} ee.size=100.1mm", *TRAIN], TEST)
     likeness = survey_split(example_split, LIBRARY)
     tree, alike, overlap = (
@@ -86,7 +87,8 @@ def test_a_near_duplicate_needs_the_tree_and_another_measure():
         (NearThresholds(tree, alike - 1e-12, overlap - 1e-12), False),
         (NearThresholds(tree * 1.01, alike, overlap), False),
     ):
-        codes = {code for code, _ in finding_keys(example_split, near=near)}
+        monkeypatch.setattr(audit_module, "NEAR_THRESHOLDS", near)
+        codes = {code for code, _ in finding_keys(example_split)}
         assert ("body-near" in codes) == expected
 
 

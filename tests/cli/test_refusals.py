@@ -106,8 +106,6 @@ HOLD_OUT composition --from ee=plane => --hold-out before composition: options s
 split new --seed 5 composition => --seed before composition: options stand after it
 split show interpolation/arm3 => no split of this name; did you mean
 split audit broken.yaml => broken.yaml:
-split audit some.yaml --near 1 => --near 1: expected a tree distance and a cosine, such as
-split audit some.yaml --near 2,0.5 => --near 2,0.5: a tree distance is from 0 to 1
 split build some.yaml --out file => cannot write to file/mine/some: Not a directory
 split build some.yaml --goal-seed 1 => --goal-seed: only with --goals
 split stats wrong.yaml => robot 'planar-cube': the library has no part 'cubw'

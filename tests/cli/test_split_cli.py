@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from helpers.commands import tree
-from helpers.splits import TEST, TRAIN, combined, member, split
+from helpers.splits import TEST, TRAIN, combined, member
 from morphgen.benchmark.split_folder import load_split_folder
 from morphgen.benchmark.survey import paper_rows
 from morphgen.splits.split import split_id
@@ -201,12 +201,6 @@ def test_leaky_split_fails_the_audit_with_reasons(run, write):
     codes = {"body-shared", "body-near", "combination-seen", "part-unseen"}
     assert {each["code"] for each in data["findings"]} == codes
     assert data["nearest"]["twin"]["tree"] == {"train": "gantry-plane", "value": 0.0}
-
-
-def test_near_option_sets_the_audit_thresholds(run, write):
-    path = write(split([*TRAIN, member(f"{TEST[0]} ee.size=0.2", "large")], TEST))
-    assert "body-near" not in run("split", "audit", path)[1]
-    assert "error body-near (1)" in run("split", "audit", path, "--near", "0.05,0.99")[1]
 
 
 def test_strict_option_makes_warnings_fail(run, write):

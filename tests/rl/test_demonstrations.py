@@ -385,7 +385,7 @@ def test_the_card_has_licences_and_results(described):
     text = (described / "README.md").read_text()
     assert "license: mit" in text
     assert "| reach  | ik " in text
-    assert "prims-000000" in (described / "LICENCES.md").read_text()
+    assert "prims-000000" in (described / "licences.json").read_text()
 
 
 @pytest.mark.slow
