@@ -7,6 +7,7 @@ import json
 import shlex
 import time
 from collections import Counter
+from dataclasses import asdict
 
 from morphgen.cli import build_parser
 from morphgen.cli.command import parse
@@ -49,7 +50,7 @@ def doctor(args: argparse.Namespace) -> int:
     passed = not counts["error"]
     seconds = time.monotonic() - start
     if args.json:
-        data = [{"section": section, **entry.as_dict()} for section, entry in results]
+        data = [{"section": section, **asdict(entry)} for section, entry in results]
         print(json.dumps({"passed": passed, "seconds": round(seconds, 1), "results": data}))
     else:
         listed = ", ".join(f"{n} {status}" for status, n in counts.items())
