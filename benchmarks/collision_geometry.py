@@ -9,7 +9,7 @@ convex hulls. Rows are kept in ``--out``, and only forms without a row are measu
 run goes on, and a new geometry needs no new rows of the others. ``--report`` only prints.
 
 Agreement: share of 1,000 random configurations in which the form collides with itself if and only
-if the triangles of the meshes do (`morphgen.fitting.fitted_robot`). Pairs of links that the form or
+if the triangles of the meshes do. Pairs of links that the form or
 the arm with meshes ignores are not tested; the column "hull, same pairs" is the agreement of the
 hulls without these pairs.
 
@@ -35,29 +35,36 @@ import math
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
+from itertools import combinations
 from pathlib import Path
+from typing import cast
 
+import fcl
 import mujoco
 import numpy as np
+import trimesh
+from numpy.typing import NDArray
 from tabulate import tabulate
 from tqdm import tqdm
 
 import morphgen
-from morphgen.checks.self_collision import SelfCollisionChecker
+from morphgen.checks.rules import triangle_collider
+from morphgen.checks.self_collision import SelfCollisionChecker, untested_pairs
 from morphgen.errors import MorphgenError
-from morphgen.fitting.fitted_robot import agreement
 from morphgen.fitting.replace_collision import as_convex, as_primitives, with_primitives
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.files import write_file
 from morphgen.formats.fits import are_primitives
 from morphgen.formats.mjcf.write import to_spec
 from morphgen.grammar.library import Library, default_library
-from morphgen.model.inertia import bounding_box
+from morphgen.model.geometry import Shape
+from morphgen.model.inertia import bounding_box, link_frame_mesh
 from morphgen.model.kinematics import forward_kinematics, random_configurations
 from morphgen.model.robot import Pair, Robot, sorted_pair
 from morphgen.typing import Array
@@ -221,6 +228,73 @@ def _measure(
             for key, row in rows.items():
                 row.speed[simulator][scene] = speeds[key]
     return [rows[key] for key in missing]
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Numbers of configurations in which meshes and a substitute (primitives, hulls) collide."""
+
+    both: int  # both the meshes and the substitute collide
+    neither: int  # neither the meshes nor the substitute collide
+    only_meshes: int  # the meshes collide, the substitute does not
+    only_other: int  # the substitute collides, the meshes do not
+
+    @property
+    def precision(self) -> float:
+        """Share of the substitute's collisions that are collisions of the meshes."""
+        return _share(self.both, self.only_other)
+
+    @property
+    def recall(self) -> float:
+        """Share of the meshes' collisions that are collisions of the substitute."""
+        return _share(self.both, self.only_meshes)
+
+    @property
+    def accuracy(self) -> float:
+        """Share of configurations in which both collide or neither does."""
+        return _share(self.both + self.neither, self.only_meshes + self.only_other)
+
+
+def agreement(
+    meshes: Robot, primitives: Robot, n: int = 1000, seed: int = 0
+) -> tuple[Agreement, Agreement]:
+    """Return how primitives, and convex hulls, agree with meshes on random self-collisions."""
+    ignored = {*untested_pairs(meshes), *primitives.ignore_pairs}
+    q = random_configurations(meshes, n, np.random.default_rng(seed))
+    mesh_collisions = list(_mesh_collisions(meshes, ignored, q))
+    # In the order of the fields of Agreement: do the meshes collide, does the substitute?
+    cases = ((True, True), (False, False), (True, False), (False, True))
+    agreements = []
+    for robot in (primitives, meshes):
+        penetrations = SelfCollisionChecker(robot, ignored).penetrations(q)
+        counts = Counter(zip(mesh_collisions, map(bool, penetrations), strict=True))
+        agreements.append(Agreement(*(counts[case] for case in cases)))
+    return agreements[0], agreements[1]
+
+
+def _mesh_collisions(robot: Robot, ignored: set[Pair], q: NDArray[np.float64]) -> Iterator[bool]:
+    """Yield for each configuration if triangles of two links intersect."""
+    names = [link.name for link in robot.links if link.collisions]
+    pairs = [pair for pair in combinations(names, 2) if sorted_pair(*pair) not in ignored]
+    models = {link.name: _model(link.collisions) for link in robot.links if link.collisions}
+    for T_root_link in forward_kinematics(robot, q):
+        for name, collider in models.items():
+            T = T_root_link[robot.link_index[name]]
+            collider.setTransform(fcl.Transform(T[:3, :3], T[:3, 3]))
+        yield any(
+            fcl.collide(models[a], models[b], fcl.CollisionRequest(), fcl.CollisionResult())
+            for a, b in pairs
+        )
+
+
+def _model(shapes: tuple[Shape, ...]) -> fcl.CollisionObject:
+    """Return the triangles of a link's shapes as one collision object in the link frame."""
+    whole = cast(trimesh.Trimesh, trimesh.util.concatenate([*map(link_frame_mesh, shapes)]))
+    return triangle_collider(np.asarray(whole.vertices), np.asarray(whole.faces))
+
+
+def _share(hits: int, misses: int) -> float:
+    return hits / (hits + misses) if hits + misses else 1.0
 
 
 def _row(name: str, key: str, robot: Robot, form: Robot) -> Row:

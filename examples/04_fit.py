@@ -14,8 +14,7 @@ import morphgen
 from morphgen.model.geometry import Box, Cylinder, Shape, Sphere
 
 # %%
-# Fit up to two boxes, cylinders and spheres to each link. `fitted.agreement()` compares
-# self-collisions with those of the meshes.
+# Fit up to two boxes, cylinders and spheres to each link.
 fitted = morphgen.fit("rethink", max_primitives=2)
 for row in fitted.report.links:
     kinds = [type(shape.geometry).__name__ for shape in row.fit.primitives]

@@ -217,8 +217,7 @@ def fit(
 
     Returns:
         The quality of each link's fit as ``report``, and the robot with primitives as ``robot``,
-        which is made at the first access; ``agreement()`` compares its self-collisions with those
-        of the meshes.
+        which is made at the first access.
 
     Raises:
         FitError: If an argument is out of its range, or no link has a shape.

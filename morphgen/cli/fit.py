@@ -14,7 +14,7 @@ from morphgen.checks import check
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, print_line, status, track
 from morphgen.errors import FitError, FormatError, MorphgenError
-from morphgen.fitting.fitted_robot import Agreement, fit_robot
+from morphgen.fitting.fitted_robot import fit_robot
 from morphgen.fitting.link_fit import FitOptions, LinkFit, fit_shapes
 from morphgen.fitting.quality import Quality
 from morphgen.fitting.robot_fit import FitReport, parts_with_meshes, store_parts
@@ -25,7 +25,6 @@ from morphgen.model.geometry import MESH_SUFFIXES, Mesh, Shape
 from morphgen.model.robot import Robot
 from morphgen.tables import table
 
-DEFAULT_CONFIGURATIONS = 1000
 COLUMNS = {
     "link": "",
     "primitives": "",
@@ -148,19 +147,12 @@ def _fit_robot(
             print(_report_text(report))
     if folder is None:
         return report.as_dict()
-    configurations = args.configurations or DEFAULT_CONFIGURATIONS
-    with status(args, f"comparing collisions in {configurations} configurations"):
-        of_primitives, of_hulls = fit.agreement(configurations, args.seed)
     fitted = replace(fit.robot, name=folder.name)  # a bundle's folder has the name of its robot
     findings = check(fitted, tool_required=source is not None)
     write_bundle(fitted, folder, findings, picture=not args.no_picture)
     if not args.json:
-        print(_agreement_text(of_primitives, of_hulls, configurations))
         print(folder)
-    return report.as_dict() | {
-        "agreement": of_primitives.as_dict(),
-        "agreement_of_hulls": of_hulls.as_dict(),
-    }
+    return report.as_dict()
 
 
 def _report_text(report: FitReport) -> str:
@@ -169,17 +161,6 @@ def _report_text(report: FitReport) -> str:
         seconds = sum(row.fit.seconds for row in report.links)
         rows.append(("mean", "", "", *_quality_cells(report.mean), seconds))
     return "\n".join([_table(rows), *map(opt.finding_line, report.findings)])
-
-
-def _agreement_text(primitives: Agreement, hulls: Agreement, n: int) -> str:
-    rows = [
-        (name, result.accuracy, result.precision, result.recall)
-        for name, result in (("primitives", primitives), ("convex hulls of meshes", hulls))
-    ]
-    shares = table(rows, ("", "agree", "precision", "recall"), formats=".3f")
-    return (
-        f"collisions in {n} random configurations, compared with the meshes' triangles:\n{shares}"
-    )
 
 
 def _table(rows: list[tuple[object, ...]]) -> str:

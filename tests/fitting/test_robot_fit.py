@@ -1,4 +1,4 @@
-"""Fitting robots: replacing meshes by primitives, shared and stored fits, and agreement."""
+"""Fitting robots: replacing meshes by primitives, shared and stored fits."""
 
 import dataclasses
 
@@ -13,7 +13,6 @@ from morphgen.cli import main
 from morphgen.errors import FitError, FormatError
 from morphgen.fitting import robot_fit
 from morphgen.fitting import token_shapes as token_shapes_module
-from morphgen.fitting.fitted_robot import agreement
 from morphgen.fitting.link_fit import FitOptions, fit_shapes
 from morphgen.fitting.quality import quality
 from morphgen.fitting.replace_collision import (
@@ -172,24 +171,6 @@ def test_a_link_that_cannot_be_fitted_is_an_error(tmp_path):
     flat = trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (1, 1, 0)], [(0, 1, 2)])
     with pytest.raises(FitError, match="link l0"):
         as_primitives(arm([mesh_shape(tmp_path, flat)]), LIBRARY.folders)
-
-
-def test_primitives_agree_better_with_meshes_than_convex_hulls():
-    meshes = load_part(LIBRARY.manifest("ur5")).fragment
-    found, _ = stored_primitives(meshes, read_stored_fits(LIBRARY.folders))
-    primitives, hulls = agreement(meshes, with_primitives(meshes, found), 300)
-    for counts in (primitives, hulls):
-        assert counts.both + counts.neither + counts.only_meshes + counts.only_other == 300
-    assert primitives.accuracy > 0.9 > hulls.accuracy
-    assert hulls.recall == 1.0
-
-
-def test_a_robot_agrees_perfectly_with_itself():
-    robot = morphgen.compose("chain beads=6")
-    same, _ = agreement(robot, robot, 200)
-    assert (same.precision, same.recall, same.accuracy) == (1, 1, 1)
-    assert same.both
-    assert same.neither
 
 
 @pytest.mark.slow
