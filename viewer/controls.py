@@ -7,14 +7,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import viser
 
 from morphgen.grammar.robot_source import is_set_folder
-from morphgen.model.kinematics import driving_joints, joint_limits
+from morphgen.model.kinematics import driving_joints
 from morphgen.model.robot import TOOL, Robot
 from morphgen.splits.split_file import split_names
-from morphgen.typing import Array
 from morphgen.viewer.app.address import AddressError, parse_count
 from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.robot_rows import folder_rows, robot_folders, split_rows
@@ -91,37 +89,23 @@ def all_roles(robots: Sequence[Robot]) -> list[str]:
     return sorted(roles, key=lambda role: (role[0] != "j", int(role.split()[1])))
 
 
-def normalized_positions(robot: Robot, q: Array) -> Array:
-    """Map joint positions to -1 at the lower limit and 1 at the upper, shape (dof,)."""
-    low, high = joint_limits(robot).T
-    half_range = np.where(high > low, (high - low) / 2, 1.0)
-    return np.asarray((q - (low + high) / 2) / half_range)
-
-
-def with_roles(robot: Robot, q: Array, values: Mapping[str, float]) -> Array:
-    """Return a configuration (dof,) with the joints of some roles moved, clipped to the limits."""
-    low, high = joint_limits(robot).T
-    target = np.array(q, dtype=np.float64)
-    for i, role in enumerate(joint_roles(robot)):
-        if role in values:
-            target[i] = (low[i] + high[i]) / 2 + values[role] * (high[i] - low[i]) / 2
-    return np.asarray(np.clip(target, low, high))
+MIDDLE = 0.5  # position of a slider whose joints are at home
 
 
 class RoleSliders:
     """Sliders that move the joints of a role in all robots of a page; other joints stay at home."""
 
-    def __init__(self, session: Session, low: float, move: Callable[[], object]) -> None:
-        """Prepare for sliders from ``low`` to 1; ``move`` is called after the user moved one."""
-        self.moved: dict[str, float] = {}  # positions of the roles that the user moved
-        self._session, self._low, self._move = session, low, move
-        self._sliders: dict[str, tuple[viser.GuiSliderHandle[float], float]] = {}
+    def __init__(self, session: Session, move: Callable[[], object]) -> None:
+        """Prepare for sliders; ``move`` is called after the user moved one."""
+        self.moved: dict[str, float] = {}  # shares of their ranges, of the roles that were moved
+        self._session, self._move = session, move
+        self._sliders: dict[str, viser.GuiSliderHandle[float]] = {}
 
-    def add(self, role: str, home: float, hint: str) -> None:
-        """Add the slider of a role; ``home`` is its position while nobody has moved it."""
+    def add(self, role: str, hint: str) -> None:
+        """Add the slider of a role, which is in the middle while nobody has moved it."""
         session, moved = self._session, self.moved
-        slider = session.client.gui.add_slider(role, self._low, 1.0, 0.01, home, hint=hint)
-        self._sliders[role] = slider, home
+        slider = session.client.gui.add_slider(role, 0.0, 1.0, 0.01, MIDDLE, hint=hint)
+        self._sliders[role] = slider
 
         def apply(text: str) -> None:
             """Take over a position of an address, unless it is invalid; the robots move later."""
@@ -139,12 +123,11 @@ class RoleSliders:
         session.on_change(slider, read, f"move {role}")
         session.keep(role.replace(" ", ""), write, apply)
 
-    def set(self, moved: Mapping[str, float]) -> None:
-        """Move roles to positions, and all others home."""
+    def go_home(self) -> None:
+        """Move all roles home."""
         self.moved.clear()
-        self.moved.update(moved)
-        for role, (slider, home) in self._sliders.items():
-            set_value(slider, moved.get(role, home))
+        for slider in self._sliders.values():
+            set_value(slider, MIDDLE)
         self._move()
 
 

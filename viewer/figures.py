@@ -1,17 +1,20 @@
-"""Figures of pages as SVG: maps and heat maps of robots, histograms."""
+"""Figures of pages: tables, maps and heat maps of similarities, histograms."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from html import escape
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
+from morphgen.encoding.similarity import MEASURES
 from morphgen.typing import Array
+from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address
 
 SIDE_COLOURS = {"train": "#1c7ed6", "test": "#f76707"}
@@ -97,6 +100,22 @@ def heatmap_svg(values: Array, names: Sequence[str], sides: Sequence[str], *, la
                 f"<title>{escape(name)} and {escape(other)}: {values[i, j]:.3f}</title></rect>"
             )
     return _svg(n * cell + 4, "".join(parts))
+
+
+def similarity_table(names: Sequence[str], similarity: Mapping[str, Array]) -> str:
+    """Return a table with a row for each pair of robots and a column for each measure."""
+    header = [""]
+    for name, measure in MEASURES.items():
+        direction = "larger" if measure.larger_is_more_alike else "smaller"
+        header.append(f"{name} ({direction} is more similar)")
+    rows = [
+        (
+            f"{escape(names[i])} and {escape(names[j])}",
+            *(f"{similarity[name][i, j]:.3f}" for name in MEASURES),
+        )
+        for i, j in combinations(range(len(names)), 2)
+    ]
+    return markup.table(header, rows, range(1, len(header)))
 
 
 def histogram_svg(

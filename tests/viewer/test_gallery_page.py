@@ -21,13 +21,13 @@ from morphgen.model.kinematics import forward_kinematics, joint_limits
 from morphgen.model.robot import Link, Robot
 from morphgen.splits.split_file import find_split, read_split
 from morphgen.viewer.app.address import AddressError, parse_address
-from morphgen.viewer.controls import all_roles, joint_roles, normalized_positions, with_roles
-from morphgen.viewer.figures import heatmap_svg, histogram_svg, map_svg
+from morphgen.viewer.controls import all_roles, joint_roles
+from morphgen.viewer.figures import heatmap_svg, histogram_svg, map_svg, similarity_table
 from morphgen.viewer.pages import population as populations
-from morphgen.viewer.pages.compare import compare_robots, similarity_table
 from morphgen.viewer.pages.gallery import parse_range
 from morphgen.viewer.pages.population import (
     ReadRobot,
+    compare_robots,
     find_source,
     make_population,
     read_robots,
@@ -230,7 +230,10 @@ def test_a_capsule_is_a_cylinder_and_two_balls():
 def test_a_role_moves_in_every_robot_by_the_same_share(population):
     q = populations.move_roles(population, population.home, {"joint 1": 1.0, "joint 2": 0.25})
     for i, robot in enumerate(population.robots):
-        expected = with_roles(robot, np.array(robot.home), {"joint 1": 1.0, "joint 2": -0.5})
+        expected, (low, high) = np.array(robot.home), joint_limits(robot).T
+        for k, role in enumerate(joint_roles(robot)):
+            if share := {"joint 1": 1.0, "joint 2": 0.25}.get(role):
+                expected[k] = low[k] + share * (high[k] - low[k])
         np.testing.assert_allclose(q[i, : robot.dof], expected)
     still = populations.move_roles(population, population.home, {})
     np.testing.assert_array_equal(still, population.home)
@@ -409,19 +412,6 @@ def test_joint_roles_count_joints_on_the_path_to_the_tool():
     assert all_roles([arm(), panda]) == [f"joint {i}" for i in range(1, 8)] + ["finger 1"]
 
 
-def test_joint_role_moves_every_robot_by_the_same_fraction():
-    for robot in (arm(), robot_of("arm=panda ee=panda_hand")):
-        home = np.array(robot.home)
-        assert with_roles(robot, home, {}) == pytest.approx(home)
-        moved = with_roles(robot, home, {"joint 2": -1.0, "finger 1": 1.0, "joint 99": 1.0})
-        rows = {role: i for i, role in enumerate(joint_roles(robot))}
-        low, high = joint_limits(robot).T
-        assert moved[rows["joint 2"]] == pytest.approx(low[rows["joint 2"]])
-        assert moved[rows["finger 1"]] == pytest.approx(high[rows["finger 1"]])
-        values = dict(zip(joint_roles(robot), normalized_positions(robot, home), strict=True))
-        assert with_roles(robot, home, values) == pytest.approx(home)
-
-
 def test_robot_compared_with_itself_is_identical():
     robots = [robot_of("base=planar ee=cube"), robot_of("base=gantry ee=plane")]
     similarity = compare_robots(robots, LIBRARY.folders)
@@ -432,22 +422,19 @@ def test_robot_compared_with_itself_is_identical():
     assert "&lt;a&gt; and b" in table
 
 
-def test_positions_of_roles_are_clipped_or_left_out_and_shown_in_the_address(viewer):
+def test_compared_robots_stand_in_a_row_and_positions_are_clipped_or_left_out(viewer):
     on = viewer()
-    query = "?compare=robots/some-arm&joint1=-3&joint2=x&joint3=nan&lost=1"
-    with PlainClient(on.port, query) as client:
-        client.shows("compare=robots/some-arm&joint1=-1")
-        before = nodes(on)["/robot0/2"].position.copy()
-        client.change(client.control("Slider", "joint 2"), 0.5)
-        client.shows("joint1=-1&joint2=0.5")
-        rotated = nodes(on)["/robot0/2"]
-        still = np.allclose(rotated.position, before) and np.allclose(rotated.wxyz, [1, 0, 0, 0])
-        assert not still
-        client.change(client.control("ButtonGroup", "Go to"), "middle")
-        client.shows("joint1=0&joint2=0&joint3=0&finger1=0")
-        client.change(client.control("ButtonGroup", "Go to"), "home")
-        shown = (0, "?compare=robots/some-arm")
-        client.until(lambda: client.addresses[-1] == shown)
+    query = "?compare=robots/some-arm&compare=robots/prims/prims-000001"
+    with PlainClient(on.port, f"{query}&joint1=-3&joint2=x&joint3=nan&lost=1") as client:
+        client.shows("some-arm and prims-000001")
+        client.until(lambda: client.addresses[-1] == (0, f"{query}&joint1=0"))
+        labels = [nodes(on)[f"/labels/{i}"] for i in range(2)]
+        assert [label.text for label in labels] == ["some-arm", "prims-000001"]
+        assert labels[0].position[1] == labels[1].position[1]
+        client.change(client.control("Slider", "joint 2"), 0.75)
+        client.shows("joint1=0&joint2=0.75")
+        client.change(client.control("Button", "Home"))
+        client.until(lambda: client.addresses[-1] == (0, query))
 
 
 def test_figures_link_to_robots_and_escape_names():

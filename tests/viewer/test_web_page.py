@@ -273,6 +273,7 @@ def test_only_the_script_of_a_page_can_change_it(viewer):
         ("?gallery=", "robots/prims"),
         ("?population=", "population=extrapolation/arms/reach"),
         ("?split=", "split=extrapolation/arms/reach"),
+        ("?compare=", "Compare two to four robots"),
         (f"?play=&chosen={B}", "Play which task?"),
         (f"?play=&chosen={B}", f'href="?play=push&amp;robot={B}"'),
     ],
@@ -280,14 +281,6 @@ def test_only_the_script_of_a_page_can_change_it(viewer):
 def test_pages_without_a_subject_list_what_there_is(shared_viewer, query, text):
     with PlainClient(shared_viewer.port, query) as client:
         client.shows(text)
-
-
-def test_compare_without_robots_offers_a_picker(shared_viewer):
-    with PlainClient(shared_viewer.port, "?compare=") as client:
-        client.shows("Compare two to four robots")
-        client.change(client.control("Text", "or words"), "arm=ur5 ee=plane")
-        client.change(client.control("Button", "Add"))
-        assert client.sent_to() == "?compare=words:arm=ur5%20ee=plane"
 
 
 def test_chosen_robots_become_the_sides_of_a_split(shared_viewer):

@@ -20,7 +20,7 @@ PAGES: Mapping[str, str] = {
     "robot": "morphgen.viewer.pages.robot:show",
     "compose": "morphgen.viewer.pages.compose:show",
     "chosen": "morphgen.viewer.pages.gallery:show_chosen",
-    "compare": "morphgen.viewer.pages.compare:show",
+    "compare": "morphgen.viewer.pages.population:show_compared",
     "split": "morphgen.viewer.pages.split:show",
     "play": "morphgen.viewer.pages.play:show",
     "demos": "morphgen.viewer.pages.demos:show",

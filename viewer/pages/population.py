@@ -1,4 +1,4 @@
-"""The page of a population: many robots on one ground, arranged, moved and selected together.
+"""The page of a population: robots on one ground, arranged, moved and selected together.
 
 They are arrays, so that a few operations move all of them. Every visual shape is an instance of a
 unit box, cylinder or sphere, or of a mesh; a capsule is three instances. Arrays over instances are
@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from html import escape
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -20,9 +21,13 @@ import viser
 from numpy.typing import NDArray
 
 from morphgen.benchmark.split_folder import SPLIT_FILE
+from morphgen.encoding.similarity import MEASURES, features, similarity_matrix
+from morphgen.encoding.tokens import default_max_links
 from morphgen.errors import MorphgenError
+from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import split_colours
 from morphgen.grammar.grammar_file import SUFFIX, grammar_names, grammar_text
+from morphgen.grammar.library import Library
 from morphgen.grammar.sampling import robot_name, sample_robot
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.kinematics import joint_limits
@@ -35,13 +40,22 @@ from morphgen.splits.split import SIDES, split_id
 from morphgen.splits.split_file import split_names
 from morphgen.typing import Array
 from morphgen.viewer import markup, robot_uri
-from morphgen.viewer.app.address import Address, parse_count
+from morphgen.viewer.app.address import MAX_COMPARED, Address, parse_count
 from morphgen.viewer.app.session import Session
 from morphgen.viewer.app.workers import Workers
 from morphgen.viewer.controls import RoleSliders, all_roles, bind, joint_roles
+from morphgen.viewer.figures import similarity_table
 from morphgen.viewer.pages.gallery import show_index
 from morphgen.viewer.robot_files import robot_facts
-from morphgen.viewer.robot_rows import UNITS, Row, facts_line, folder_rows, sort_rows, split_rows
+from morphgen.viewer.robot_rows import (
+    UNITS,
+    Row,
+    facts_line,
+    folder_rows,
+    sort_rows,
+    split_rows,
+    uri_rows,
+)
 from morphgen.viewer.scene import stage
 from morphgen.viewer.scene.robot import robot_bounds
 
@@ -73,7 +87,7 @@ class Population:
     lower: Array  # lower joint limits, padded with 0, shape (n, J) [rad or m]
     upper: Array  # upper joint limits, padded with 0, shape (n, J) [rad or m]
     home: Array  # home configurations within the limits, padded with 0, shape (n, J) [rad or m]
-    roles: tuple[str, ...]  # roles of the joints of any robot; see `comparison.joint_roles`
+    roles: tuple[str, ...]  # roles of the joints of any robot; see `controls.joint_roles`
     role: NDArray[np.intp]  # index into `roles`, shape (n, J); `len(roles)` for padding
 
     home_bounds: Array  # lowest and highest corners at home, shape (n, 2, 3) [m]
@@ -307,8 +321,12 @@ def find_source(subject: str, files: robot_uri.FileAccess, seed: int, number: in
     elif side:
         raise robot_uri.UriError(f"{subject}: only a split has sides; {name} is a folder")
     else:
-        rows = folder_rows(name, files)
-        stamp = "\n".join(robot_uri.content_hash(row.uri, files) for row in rows[:MAX_ROBOTS])
+        return _listed_source(folder_rows(name, files), files)
+    return Source(tuple(rows[:MAX_ROBOTS]), len(rows), stamp=stamp)
+
+
+def _listed_source(rows: Sequence[Row], files: robot_uri.FileAccess) -> Source:
+    stamp = "\n".join(robot_uri.content_hash(row.uri, files) for row in rows[:MAX_ROBOTS])
     return Source(tuple(rows[:MAX_ROBOTS]), len(rows), stamp=stamp)
 
 
@@ -362,14 +380,20 @@ Labels = list[tuple[str, tuple[float, float]]]  # texts on the ground and their 
 def arrange(population: Population, fact: str = "") -> tuple[Array, Labels]:
     """Return positions (n, 2) [m] of robots in rows from the far left to the near right.
 
-    With a fact, the smallest come first, and labels have the values of rows' first robots.
+    With a fact, the smallest come first, and labels have the values of rows' first robots. Without,
+    few robots stand in one row, with their names.
     """
     rows, bounds = population.rows, population.home_bounds
     index = {row.uri: i for i, row in enumerate(rows)}
     order = [index[row.uri] for row in sort_rows(rows, fact)] if fact else list(range(len(rows)))
-    places, firsts = _rows_of(bounds[order])
+    is_one_row = not fact and len(rows) <= MAX_COMPARED
+    places, firsts = _rows_of(bounds[order], one=is_one_row)
     positions = np.zeros((len(rows), 2))
     positions[order] = places
+    if is_one_row:
+        return positions, [
+            (row.name, (x, y)) for row, (x, y) in zip(rows, positions.tolist(), strict=True)
+        ]
     if not fact:
         return positions, []
     edge = float((places[:, 0] + bounds[order, 0, 0]).min()) - _LABEL_GAP
@@ -381,7 +405,7 @@ def arrange(population: Population, fact: str = "") -> tuple[Array, Labels]:
     return positions, labels
 
 
-def _rows_of(bounds: Array) -> tuple[Array, list[int]]:
+def _rows_of(bounds: Array, *, one: bool) -> tuple[Array, list[int]]:
     """Return a place (n, 2) [m] for each robot, like words of a text, and each row's first robot.
 
     A row takes the depth of most of its robots, so that few large ones do not shrink others.
@@ -391,7 +415,9 @@ def _rows_of(bounds: Array) -> tuple[Array, list[int]]:
     # Rows also need room for their height, by which they hide what is behind them.
     depth = np.maximum(1.2 * size[:, 1], np.maximum(0.35 * size[:, 0], 0.75 * size[:, 2]))
     ends = np.cumsum(slot)
-    num_rows = max(round(ends[-1] / math.sqrt(ASPECT * float((slot * depth).sum()))), 1)
+    num_rows = (
+        1 if one else max(round(ends[-1] / math.sqrt(ASPECT * float((slot * depth).sum()))), 1)
+    )
     row = np.minimum((ends - slot / 2) / ends[-1] * num_rows, num_rows - 1e-9).astype(int)
     positions, firsts, y = np.zeros((len(bounds), 2)), [], 0.0
     for k in np.unique(row):
@@ -413,9 +439,12 @@ ARRANGEMENTS = {
     "dof": "rows by DoF",
 }
 """Labels of the arrangements by their key in the address."""
-MIDDLE = 0.5  # position of a slider whose joints are at home
 CAMERA_DIRECTION = (0.08, -0.8, 0.6)  # to the camera, which sees rows from left to right
 _NUM_NAMED = 5  # selected robots that are listed
+NONE_TO_COMPARE = (
+    "<h2>Compare two to four robots</h2>Tick the box of cards in a gallery, or of a robot's page, "
+    "and press <i>compare</i> below."
+)
 
 
 def show(session: Session) -> None:
@@ -429,7 +458,26 @@ def show(session: Session) -> None:
     source = find_source(subject, session.files, seed, number)
     for key in ("seed", "number") if source.grammar else ():
         session.keep(key)
-    crumbs = markup.breadcrumbs((subject, _gallery_address(subject, source)), ("population", None))
+    _open(session, source, (subject, _gallery_address(subject, source)), ("population", None))
+
+
+def show_compared(session: Session) -> None:
+    """Build the page that compares few robots: their population, and how similar they are."""
+    uris = tuple(filter(None, session.address.subjects))
+    if len(uris) > MAX_COMPARED:
+        raise robot_uri.UriError(f"{len(uris)} robots to compare: expected 2 to {MAX_COMPARED}")
+    if uris:
+        rows = uri_rows(uris, session.files)
+        _open(session, _listed_source(rows, session.files), ("compare", None))
+        return
+    session.open_panel(PANEL_WIDTH, markup.breadcrumbs(("compare", None)))
+    session.client.gui.add_html(markup.framed(NONE_TO_COMPARE))
+    session.show_address("compare")
+
+
+def _open(session: Session, source: Source, *steps: tuple[str, Address | None]) -> None:
+    """Open the panel, and show the robots when they are read."""
+    crumbs = markup.breadcrumbs(*steps)
     session.open_panel(PANEL_WIDTH, crumbs, f"reading {len(source.rows)} robots")
 
     def load() -> None:
@@ -469,11 +517,12 @@ class PopulationPage:
         self.selected = np.zeros(len(population), np.bool_)  # mask of the selected robots
         self._labels: list[viser.LabelHandle] = []
         gui.add_html(markup.framed(summary(source, population, faults)))
+        self._similarity = gui.add_html("")
         self._arrange = gui.add_dropdown("Arrange", tuple(ARRANGEMENTS.values()))
         home = gui.add_button("Home", icon=viser.Icon.HOME)
         bind(session, "arrange", self._arrange, tuple(ARRANGEMENTS))
         session.keep("select", lambda: format_selection(self.selected), self._apply_selection)
-        self._sliders = RoleSliders(session, 0.0, self._move)
+        self._sliders = RoleSliders(session, self._move)
         self._add_sliders()
         self._selection = gui.add_html("")
         select = gui.add_button_group("Select", ("all", "none", "invert"))
@@ -481,15 +530,34 @@ class PopulationPage:
             "Choose", icon=viser.Icon.CHECKBOX, hint="add them to the chosen robots"
         )
         session.on_change(self._arrange, self._show_arrangement, "arrange")
-        session.on_change(home, lambda: self._sliders.set({}))
+        session.on_change(home, self._sliders.go_home)
         session.on_change(select, lambda: self._change_selection(select.value))
         session.on_change(choose, self._choose)
         self._connect_pointer()
         session.set_status("")
-        session.title = session.address.subject
+        is_comparison = session.address.page == "compare"
+        names = ", ".join(row.name for row in population.rows)
+        session.title = f"compare {names}" if is_comparison else session.address.subject
         session.apply_state()
         self._show_arrangement()
         self.select(self.selected)
+        if is_comparison:
+            session.run_in_background(self._compare)
+
+    def _compare(self) -> None:
+        """Show how similar the robots are, or why they cannot be compared."""
+        session, rows = self.session, self.population.rows
+        lines = markup.dim("<br>".join(map(_row_line, rows)))
+        try:
+            with session.activity("comparing"):
+                similarity = session.workers.call(
+                    compare_robots, self.population.robots, session.files.library_folders
+                )
+            table = f"<h3>Similarity</h3>{similarity_table([row.name for row in rows], similarity)}"
+        except MorphgenError as error:
+            tag = markup.tag("cannot be compared", "warning")
+            table = f"{tag}{escape(session.files.redact(error))}"
+        self._similarity.content = markup.framed(lines, table)
 
     def select(self, selected: NDArray[np.bool_]) -> None:
         """Select robots by a mask (n,), in the scene, the panel and the address."""
@@ -527,7 +595,7 @@ class PopulationPage:
                 with gui.add_folder(title, expand_by_default=initial == "j"):
                     for name in names:
                         count = int((role == roles.index(name)).any(axis=1).sum())
-                        self._sliders.add(name, MIDDLE, f"share of its range, of {count} robots")
+                        self._sliders.add(name, f"share of its range, of {count} robots")
 
     def _configurations(self) -> NDArray[np.float64]:
         """Return the configurations of all robots, shape (n, J) [rad or m]."""
@@ -606,11 +674,7 @@ def selection_text(rows: Sequence[Row]) -> str:
     """Return the selected robots with links, and the ranges of their facts, as HTML."""
     if not rows:
         return markup.dim("no robot is selected")
-    lines = [
-        f"{markup.link(Address('robot', (row.uri,)), row.name)} {escape(facts_line(row))}"
-        + (f" {escape(', '.join(row.findings))}" if row.findings else "")
-        for row in rows[:_NUM_NAMED]
-    ]
+    lines = [_row_line(row) for row in rows[:_NUM_NAMED]]
     if len(rows) > _NUM_NAMED:
         lines.append("...")
     for fact in ("reach", "mass", "dof") if len(rows) > 1 else ():
@@ -620,6 +684,25 @@ def selection_text(rows: Sequence[Row]) -> str:
             numbers = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
             lines.append(f"{'' if fact == 'dof' else fact + ' '}{numbers} {UNITS[fact]}")
     return f"<b>{len(rows)} selected</b>{markup.dim('<br>'.join(lines))}"
+
+
+def _row_line(row: Row) -> str:
+    """Return a robot with a link, its facts and findings as HTML."""
+    findings = escape(", ".join(row.findings or ()))
+    link = markup.link(Address("robot", (row.uri,)), row.name)
+    return f"{link} {escape(facts_line(row))} {findings}".rstrip()
+
+
+def compare_robots(robots: Sequence[Robot], folders: Sequence[Path]) -> dict[str, Array]:
+    """Return the similarity of every pair by measure, shape (n, n). Runs in a worker."""
+    library = Library(folders)
+    robots = [robot_uri.with_library_meshes(robot, library) for robot in robots]
+    # Splits fix the number of links; here the largest robot does.
+    max_links = default_max_links(len(robot.links) for robot in robots)
+    compared = [
+        features(robot, token_shapes(robot, folders), max_links=max_links) for robot in robots
+    ]
+    return {name: similarity_matrix(compared, name) for name in MEASURES}
 
 
 def format_selection(selected: NDArray[np.bool_]) -> str:

@@ -90,7 +90,6 @@ def _links(robot: Robot, uri: str) -> str:
     if robot.provenance.get("derivation"):
         target = Address("compose", (uri.removeprefix(robot_uri.WORDS),))
         links.append(markup.link(target, "Edit in Compose"))
-    links.append(markup.link(Address("compare", (uri,)), "compare"))
     if robot.tool and robot.dof:
         play = (markup.link(Address("play", (task,), robots=(uri,)), task) for task in TASKS)
         links.append(f"see it {' · '.join(play)}")
