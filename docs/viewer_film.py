@@ -76,7 +76,7 @@ def states(page: Any, address: str) -> Iterator[str]:  # noqa: ANN401
     slider.focus()
     for _ in range(60):
         slider.press("ArrowRight")
-    page.get_by_text(re.compile("changed: ")).first.wait_for()
+    page.wait_for_url(re.compile(r"\?compose=.*arm"))
     yield "edited"
     page.get_by_role("tab", name="Get").click()
     page.get_by_role("button", name="Write to robots/").click()

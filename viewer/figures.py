@@ -1,4 +1,4 @@
-"""Figures of pages: tables, maps and heat maps of similarities, histograms."""
+"""Figures of pages: tables, maps and heat maps of similarities."""
 
 from __future__ import annotations
 
@@ -18,8 +18,6 @@ from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address
 
 SIDE_COLOURS = {"train": "#1c7ed6", "test": "#f76707"}
-CHOSEN, NOT_CHOSEN = "#339af0", "#adb5bd88"  # bars inside and outside a range
-_NUM_BARS, _HISTOGRAM_HEIGHT = 40, 60  # bars of a histogram, and its height in units of the SVG
 _WIDTH = 480  # width of an SVG in its own units
 _MAP_WIDTH, _MAP_CELL, _MAP_LABEL = 900.0, (100.0, 95.0), 18
 """Width of a map, width and height of a robot with its name, and letters of a name that fit."""
@@ -116,25 +114,6 @@ def similarity_table(names: Sequence[str], similarity: Mapping[str, Array]) -> s
         for i, j in combinations(range(len(names)), 2)
     ]
     return markup.table(header, rows, range(1, len(header)))
-
-
-def histogram_svg(
-    values: Sequence[float], limits: tuple[float, float], chosen: tuple[float, float]
-) -> str:
-    """Draw how many values are where, as bars; bars outside a chosen range are grey."""
-    counts, edges = np.histogram(values, _NUM_BARS, limits)
-    width, tallest = _WIDTH / _NUM_BARS, max(int(counts.max()), 1)
-    parts = []
-    for count, start, end in zip(counts.tolist(), edges[:-1], edges[1:], strict=True):
-        inside = end >= chosen[0] and start <= chosen[1]
-        height = _HISTOGRAM_HEIGHT * count / tallest
-        x = (start - limits[0]) / (limits[1] - limits[0]) * _WIDTH
-        parts.append(
-            f'<rect x="{x:.1f}" y="{_HISTOGRAM_HEIGHT - height:.1f}" width="{width - 1:.1f}" '
-            f'height="{height:.1f}" fill="{CHOSEN if inside else NOT_CHOSEN}">'
-            f"<title>{count} robots from {start:.3g} to {end:.3g}</title></rect>"
-        )
-    return _svg(_HISTOGRAM_HEIGHT, "".join(parts))
 
 
 def _svg(height: float, content: str, width: float = _WIDTH) -> str:

@@ -37,12 +37,9 @@ def wait_until(condition):
     assert condition()
 
 
-def pointer(kind, node, **more):
-    """Return the message of a click on, or a drag of, a scene node that a client was sent."""
-    message = {"type": f"SceneNode{kind}Message", "name": node["name"], "owner": node["owner"]}
-    message |= {"instance_index": None, "modifier": None}
-    if kind == "Click":
-        ray = {"ray_origin": [1.0, 0.0, 0.0], "ray_direction": [-1.0, 0.0, 0.0]}
-        return {**message, **ray, "screen_pos": [0.5, 0.5], **more}
-    places = {"start_screen_pos": [0.5, 0.5], "end_screen_pos": [0.5, 0.5], "button": "left"}
-    return {**message, **places, **more}
+def click_on(node, **more):
+    """Return the message of a click on a scene node that a client was sent."""
+    message = {"type": "SceneNodeClickMessage", "name": node["name"], "owner": node["owner"]}
+    message |= {"instance_index": None, "modifier": None, "screen_pos": [0.5, 0.5]}
+    ray = {"ray_origin": [1.0, 0.0, 0.0], "ray_direction": [-1.0, 0.0, 0.0]}
+    return {**message, **ray, **more}

@@ -34,7 +34,6 @@ ACCEPTED_MESSAGES: Mapping[str, type[Any]] = {
         UploadPart,
         ScenePointer,
         _messages.SceneNodeClickMessage,
-        _messages.SceneNodeDragMessage,
         _messages.ViewerCameraMessage,
         _messages.TransformControlsUpdateMessage,
         _messages.TransformControlsDragStartMessage,

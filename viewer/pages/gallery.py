@@ -16,7 +16,7 @@ from morphgen.grammar.grammar_file import grammar_names
 from morphgen.rl.demonstrations.lerobot import RECORDING
 from morphgen.splits.split import SIDES
 from morphgen.splits.split_file import split_names
-from morphgen.viewer import figures, markup, robot_rows
+from morphgen.viewer import markup, robot_rows
 from morphgen.viewer.app.address import Address, AddressError, parse_count
 from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.session import Session, set_value
@@ -40,8 +40,6 @@ class Gallery:
     thumbnails: dict[str, str] = field(default_factory=dict)  # thumbnails drawn so far, by URI
     faults: dict[str, str] = field(default_factory=dict)  # errors of unreadable robots, by URI
     controls: dict[str, Any] = field(default_factory=dict)  # controls by their key in the address
-    histograms: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
-    """Distributions of the facts above their sliders."""
     empty: str = ""  # HTML in place of the cards if no robot passes the filter
     grid: viser.GuiHtmlHandle | None = None
     summary: str = ""  # number of robots that pass the filter, and of the page
@@ -146,16 +144,6 @@ def empty_text(gallery: Gallery) -> str:
     return f"<h3>No robot passes the filter</h3>{table}<p>{clear}</p>"
 
 
-def show_histograms(gallery: Gallery) -> None:
-    """Show how many robots have each value of a fact; those that the slider lets pass stand out."""
-    for fact, handle in gallery.histograms.items():
-        values = [float(v) for row in gallery.rows if (v := getattr(row, fact)) is not None]
-        control = gallery.controls[fact]
-        low, high = control.value
-        svg = figures.histogram_svg(values, (control.min, control.max), (low, high))
-        handle.content = markup.framed(f'<div class="histogram">{svg}</div>')
-
-
 def parse_range(fact: str, text: str, limits: tuple[float, float] | None) -> tuple[float, float]:
     """Parse ``LOW..HIGH`` of an address."""
     first, dots, last = text.partition("..")
@@ -208,7 +196,6 @@ def _add_range(gallery: Gallery, fact: str) -> None:
         return
     step = 1.0 if fact in _COUNTS else 0.001
     low, high = limits[0] - limits[0] % step, limits[1] + (-limits[1]) % step
-    gallery.histograms[fact] = gui.add_html("")
     slider = gui.add_multi_slider(_LABELS[fact], low, high, step, (low, high))
     gallery.controls[fact] = slider
 
@@ -354,7 +341,6 @@ def show_page(gallery: Gallery, number: int) -> None:
     gallery.summary = f"{len(rows)}{total} {noun} · page {gallery.page_number} of {count}"
     gallery.empty = "" if rows else empty_text(gallery)
     load_bundle_pictures(gallery, gallery.page_rows)
-    show_histograms(gallery)
     draw_cards(gallery)
 
     def draw_missing() -> None:

@@ -38,15 +38,13 @@ from morphgen.viewer.robot_rows import neighbour_uris
 from morphgen.viewer.scene import overlays as scene_overlays
 from morphgen.viewer.scene import robot as scene_robot
 from morphgen.viewer.scene import stage as scene_stage
-from morphgen.viewer.scene.overlays import NUM_POINTS, OFTEN, SELDOM, remove_overlay
+from morphgen.viewer.scene.overlays import remove_overlay
 
 WEB_PAGE = "robot.html"  # name of the web page in a bundle
 PANEL_WIDTH = 390.0  # width of the panel [pixels]
 RENDER_TIMEOUT = 60.0  # time in which the browser has to send a screenshot [s]
 NO_LINK = "(none)"  # choice of the dropdown of links that selects none
 ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": 180 / math.pi}  # number per radian
-_DRAG_ROUNDS = 4  # Newton steps by which a joint follows the pointer, per event
-_MAX_TURN = 0.4  # largest such step [rad or m]
 
 
 def show(session: Session) -> None:
@@ -261,12 +259,9 @@ class RobotPage:
         self._mark.content = style
 
     def _connect_links(self) -> None:
-        """Let clicks in the scene select links, and drags turn their joints."""
+        """Let clicks in the scene select links."""
         for link, frame in enumerate(self.view.links):
             frame.on_click(functools.partial(self._clicked, self.robot.links[link].name))
-            row = joint_of_link(self.robot, link)
-            if row is not None:
-                frame.on_drag(_LinkDrag(self, link, row).moved)
 
     async def _clicked(self, name: str, event: viser.SceneNodePointerEvent[Any]) -> None:
         del event
@@ -289,57 +284,11 @@ class RobotPage:
         session.enqueue(self.update_scene, "move")
 
     def _show_findings(self, findings: Sequence[Finding]) -> None:
-        """Show the findings on their tab, the selected link's card, and the boxes of inertia."""
+        """Show the findings on their tab and the selected link's card."""
         self.findings = tuple(findings)
         table = markup.findings_table(findings, self.session.files.redact)
         self._findings.content = markup.framed(table)
-        self._layers.show_inertia()
         self._show_card()
-
-
-class _LinkDrag:
-    """A drag of one link, which turns the joint above it."""
-
-    def __init__(self, page: RobotPage, link: int, row: int) -> None:
-        """Remember the link and the index in q of its joint."""
-        self._page, self._link, self._row = page, link, row
-        self._point = self._target = np.zeros(3)
-
-    async def moved(self, event: viser.SceneNodeDragEvent[Any]) -> None:
-        """Follow the pointer; the gripped point is fixed to the link."""
-        page = self._page
-        if event.phase == "start":
-            T_root_link = page.view.T_root_link[self._link]
-            offset = np.array(event.start_position) - T_root_link[:3, 3]
-            self._point = T_root_link[:3, :3].T @ offset
-        self._target = np.array(event.end_position)
-        if event.phase != "end":
-            page.session.enqueue(self._follow, "drag link")
-
-    def _follow(self) -> None:
-        page = self._page
-        page.move(
-            turn_towards(page.robot, page.q, self._row, self._link, self._point, self._target)
-        )
-
-
-def turn_towards(robot: Robot, q: Array, row: int, link: int, point: Array, target: Array) -> Array:
-    """Return q (dof,) where a point of a link (its frame) is near a target (root frame) [m]."""
-    q, (low, high) = q.copy(), kinematics.joint_limits(robot)[row]
-    column = robot.mimic_map[0][:, row]
-    for _ in range(_DRAG_ROUNDS):
-        T_root_link = kinematics.forward_kinematics(robot, q)
-        position = T_root_link[link, :3, :3] @ point + T_root_link[link, :3, 3]
-        linear, angular = (kinematics.link_jacobians(robot, T_root_link)[link] @ column).reshape(
-            2, 3
-        )
-        velocity = linear + np.cross(angular, position)
-        square = float(velocity @ velocity)
-        if square < 1e-12:  # the point is on the joint's axis
-            break
-        step = float(velocity @ (target - position)) / square
-        q[row] = np.clip(q[row] + np.clip(step, -_MAX_TURN, _MAX_TURN), low, high)
-    return q
 
 
 def joint_of_link(robot: Robot, link: int) -> int | None:
@@ -381,33 +330,23 @@ _XRAY_OPACITY = 0.2  # opacity of visual shapes in the x-ray view
 _GROWTH = 0.002
 """Distance by which collision shapes and primitives are grown while visual shapes are shown, in
 extents of the robot: surfaces at the same place would flicker."""
-_STEP = 0.01  # step of the workspace's slice [m]
 
 
 class Layers:
     """The tab with a check box for everything that can be shown of a robot."""
 
     def __init__(self, page: RobotPage) -> None:
-        """Add the check boxes, and the slider of the workspace's slice."""
+        """Add the check boxes."""
         gui, session = page.session.client.gui, page.session
         self._page, self._session, self._robot = page, session, page.robot
         self._view = page.view
         self._primitives: Sequence[Sequence[Shape]] | None = None  # by link, once they were shown
-        self._workspace: tuple[Array, scene_stage.Triangles] | None = None
-        """Tool positions (n, 3) [m] and their shell, once they are sampled."""
         self._gizmo: viser.TransformControlsHandle | None = None
         self._is_dragging = False
         names = [name for name in TOGGLES if page.robot.tool or name not in TOOL_TOGGLES]
         self._boxes = {name: gui.add_checkbox(name, name == "visual") for name in names}
-        extent = scene_robot.robot_extent(page.robot)
-        self._slice = gui.add_slider(
-            "slice at y [m]", -2 * extent, 2 * extent, _STEP, 0.0, visible=False
-        )
-        self._legend = gui.add_html("")
         for name, box in self._boxes.items():
             session.on_change(box, functools.partial(self._toggle, name))
-        session.on_change(self._slice, self._move_slice, "slice")
-        bind(session, "slice", self._slice)
         session.keep("show", self._write, self._apply)
 
     def show(self) -> None:
@@ -445,8 +384,10 @@ class Layers:
                 self._show_visual()
             case "collision" | "primitives":
                 self._show_layer(name)
+            case "inertia" if on:
+                self._view.show_inertia()
             case "inertia":
-                self.show_inertia()
+                self._view.remove_layer("inertia")
             case "frames":
                 self._view.show_axes(on)
             case "workspace":
@@ -487,15 +428,6 @@ class Layers:
                 _GROWTH * extent if self._has_visual() else 0.0,
             )
 
-    def show_inertia(self) -> None:
-        """Draw the boxes of inertia with the findings about them, or remove both."""
-        remove_overlay(self._view, "inertia findings")
-        if self._is_on("inertia"):
-            self._view.show_inertia()
-            scene_overlays.show_inertia_findings(self._view, self._page.findings)
-        else:
-            self._view.remove_layer("inertia")
-
     def _fit_primitives(self) -> None:
         """Draw the primitives fitted to the links; fits that are not stored are computed."""
         session, folders = self._session, self._session.files.library_folders
@@ -515,35 +447,19 @@ class Layers:
             self._session.run_in_background(self._sample_workspace)
             return
         remove_overlay(self._view, "workspace")
-        self._slice.visible, self._legend.content = False, ""
         scene_stage.look_at(self._session.client, *scene_robot.robot_bounds(self._robot))
 
     def _sample_workspace(self) -> None:
         with self._session.activity("sampling the workspace"):
-            points = scene_overlays.sample_workspace(self._robot)
-            self._workspace = points, scene_overlays.shell(points)
-        self._session.enqueue(lambda: self._show_workspace(points))
+            shell = scene_overlays.workspace_shell(self._robot)
+        self._session.enqueue(lambda: self._show_workspace(shell))
 
-    def _show_workspace(self, points: Array) -> None:
-        """Show sampled tool positions, cut at the position that the address asks for."""
-        if not self._is_on("workspace"):
-            return
-        slider, (low, high) = self._slice, (points.min(axis=0), points.max(axis=0))
-        slider.min = float(np.floor(low[1] / _STEP) * _STEP)
-        slider.max = float(max(np.ceil(high[1] / _STEP) * _STEP, slider.min + _STEP))
-        set_value(slider, float(np.clip(slider.value, slider.min, slider.max)))
-        slider.visible = True
-        self._legend.content = markup.framed(_legend(high - low))
-        self._move_slice()
-        robot_low, robot_high = scene_robot.robot_bounds(self._robot)
-        low, high = np.minimum(low, robot_low), np.maximum(high, robot_high)
-        scene_stage.look_at(self._session.client, low, high)
-
-    def _move_slice(self) -> None:
-        if self._workspace is not None and self._is_on("workspace"):
-            with self._session.client.atomic():
-                scene_overlays.show_workspace(self._view, *self._workspace, self._slice.value)
-            self._session.show_state_later()
+    def _show_workspace(self, shell: scene_stage.Triangles) -> None:
+        if self._is_on("workspace"):
+            scene_overlays.show_workspace(self._view, shell)
+            bounds = (*scene_robot.robot_bounds(self._robot), *shell[0])
+            low, high = np.min(bounds, axis=0), np.max(bounds, axis=0)
+            scene_stage.look_at(self._session.client, low, high)
 
     def _toggle_gizmo(self, on: bool) -> None:
         """Add or remove a gizmo at the tool; the robot follows it by inverse kinematics."""
@@ -574,20 +490,6 @@ class Layers:
                 self._page.move(kinematics.solve_pose_ik(self._robot, T_root_gizmo, self._page.q))
 
         gizmo.on_update(dragged)
-
-
-def _legend(sides: Array) -> str:
-    """Return what the colours of the workspace mean; its sides have shape (3,) [m]."""
-    seldom, often = (f"rgb{tuple(colour.tolist())}" for colour in (SELDOM, OFTEN))
-    size = " × ".join(f"{side:.2f}" for side in sides)  # noqa: RUF001
-    return (
-        f'<div class="scale" style="background:linear-gradient(90deg,{seldom},{often})"></div>'
-        + '<div class="ends"><span>few configurations</span><span>many</span></div>'
-        + markup.dim(
-            f"Surface: outermost tool positions of {NUM_POINTS:,} random configurations, "
-            f"{size} m. Slice: how many of them lead to each cell."
-        )
-    )
 
 
 def _add_downloads(page: RobotPage) -> None:

@@ -1,43 +1,26 @@
-"""Drawings over a robot: axes, names, findings, workspace, and marks of a selection."""
+"""Drawings over a robot: axes, names, workspace, and marks of a selection."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 import trimesh
-from scipy.ndimage import binary_closing, gaussian_filter
 from scipy.spatial import cKDTree
 
-from morphgen.model.findings import Finding
-from morphgen.model.geometry import Box
 from morphgen.model.kinematics import frame_positions, random_configurations
 from morphgen.model.robot import Link, Robot
 from morphgen.model.rotation import Vec3
 from morphgen.typing import Array
 from morphgen.viewer.scene.robot import RobotView, robot_extent
-from morphgen.viewer.scene.stage import Rgb, Triangles, batch_colours, grown_triangles, triangles
+from morphgen.viewer.scene.stage import Rgb, Triangles, grown_triangles
 
 NUM_POINTS = 200_000  # configurations that are sampled for a workspace
 _SHELL_SUBDIVISIONS = 3  # divisions of an icosahedron: 642 vertices, the shell's directions
-_CELLS = 48  # cells of a slice along the longest side of the workspace
 
 
-@dataclass(frozen=True, eq=False)
-class Slice:
-    """Cells of a vertical plane y = constant that the tool reaches."""
-
-    centres: Array  # shape (n, 3) [m]
-    side: float  # side of a cell [m]
-    density: Array  # configurations near each cell, relative to the most, shape (n,)
-
-
-def sample_workspace(robot: Robot) -> Array:
-    """Return tool positions at uniformly random configurations, shape (n, 3) [m]."""
+def workspace_shell(robot: Robot) -> Triangles:
+    """Return the outermost tool positions of uniformly random configurations."""
     q = random_configurations(robot, NUM_POINTS, np.random.default_rng(0))
-    return frame_positions(robot, q.T).T
+    return shell(frame_positions(robot, q.T).T)
 
 
 def shell(points: Array) -> Triangles:
@@ -53,28 +36,8 @@ def shell(points: Array) -> Triangles:
     return vertices.astype(np.float32), faces.astype(np.uint32)
 
 
-def cut(points: Array, y: float) -> Slice:
-    """Return the cells of the plane y [m] near which some of the tool positions (n, 3) [m] are."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    side = max(float((high - low).max()), 1e-3) / _CELLS
-    near = points[np.abs(points[:, 1] - y) < side]
-    shape = np.maximum(np.ceil((high - low) / side).astype(int), 1)[[0, 2]]
-    ends = [(low[k], low[k] + n * side) for k, n in zip((0, 2), shape, strict=True)]
-    count, *_ = np.histogram2d(near[:, 0], near[:, 2], bins=shape, range=ends)
-    filled = gaussian_filter(count, 0.8)  # random samples leave holes
-    i, k = np.nonzero(binary_closing(count > 0) | (count > 0))
-    centres = np.stack(
-        [low[0] + (i + 0.5) * side, np.full(len(i), y), low[2] + (k + 0.5) * side], axis=1
-    )
-    return Slice(centres, side, filled[i, k] / max(float(filled.max()), 1e-9))
-
-
 _ORANGE, _BLUE, _GREY, _BLACK = (247, 103, 7), (25, 113, 194), (134, 142, 150), (33, 37, 41)
-_AMBER: Rgb = (232, 89, 12)  # colour of the inertia of links with findings about it
 _SHELL: Rgb = (76, 110, 245)
-SELDOM, OFTEN = np.array([231, 245, 255]), np.array([54, 79, 199])
-"""Colours of a slice of the workspace where few and where most configurations lead."""
-_INERTIA_CODES = ("inertia", "mass", "com-", "density")  # beginnings of codes about inertia
 _NAME_DISTANCE = 0.045  # distance below which links share a label, in extents of the robot
 
 
@@ -87,16 +50,6 @@ def remove_overlay(view: RobotView, name: str) -> None:
 def _centre(link: Link) -> Vec3:
     """Return a link's centre of mass, or its origin if it has no mass."""
     return link.inertial.com if link.inertial else (0.0, 0.0, 0.0)
-
-
-def _add_label(view: RobotView, i: int, name: str, text: str) -> Any:  # noqa: ANN401
-    return view.scene.add_label(
-        f"{view.name}/{i}/{name}",
-        text,
-        font_screen_scale=0.75,
-        position=_centre(view.robot.links[i]),
-        anchor="center-left",
-    )
 
 
 def show_joint_axes(view: RobotView) -> None:
@@ -163,39 +116,23 @@ def show_names(view: RobotView) -> None:
         else:
             group[2].append(link.name)
     view.overlays["names"] = [
-        _add_label(view, i, "name", f"{first} + {len(more)}" if more else first)
+        view.scene.add_label(
+            f"{view.name}/{i}/name",
+            f"{first} + {len(more)}" if more else first,
+            font_screen_scale=0.75,
+            position=_centre(view.robot.links[i]),
+            anchor="center-left",
+        )
         for i, _, (first, *more) in groups
     ]
 
 
-def show_inertia_findings(view: RobotView, findings: Sequence[Finding]) -> None:
-    """Write findings about mass and inertia beside the links' boxes, and colour these boxes."""
-    remove_overlay(view, "inertia findings")
-    nodes, colours = [], {}
-    for i, link in enumerate(view.robot.links):
-        about = [
-            finding
-            for finding in findings
-            if finding.where == f"link {link.name}" and finding.code.startswith(_INERTIA_CODES)
-        ]
-        if not about:
-            continue
-        colours[link.name] = _AMBER
-        text = f"{link.name}: {', '.join(finding.code for finding in about)}"
-        nodes.append(_add_label(view, i, "inertia_finding", text))
-    view.paint("inertia", colours)
-    view.overlays["inertia findings"] = nodes
-
-
-def show_workspace(view: RobotView, points: Array, outside: Triangles, y: float) -> None:
-    """Draw the shell of tool positions (n, 3) [m] behind a plane at y [m], and the slice in it."""
-    remove_overlay(view, "workspace")
-    section, (vertices, faces) = cut(points, y), outside
-    nodes: list[Any] = [
+def show_workspace(view: RobotView, outside: Triangles) -> None:
+    """Draw the shell of the tool's positions."""
+    view.overlays["workspace"] = [
         view.scene.add_mesh_simple(
             f"{view.name}/workspace",
-            vertices,
-            faces[(vertices[:, 1] >= y)[faces].all(axis=1)],
+            *outside,
             color=_SHELL,
             opacity=0.22,
             side="double",
@@ -203,22 +140,6 @@ def show_workspace(view: RobotView, points: Array, outside: Triangles, y: float)
             receive_shadow=False,
         )
     ]
-    if len(section.centres):
-        cell = (section.side, 0.02 * section.side, section.side)
-        share = np.sqrt(section.density)[:, None]  # most cells are reached seldom
-        nodes.append(
-            view.scene.add_batched_meshes_simple(
-                f"{view.name}/workspace_slice",
-                *triangles(Box(cell)),
-                batched_wxyzs=np.tile((1.0, 0.0, 0.0, 0.0), (len(section.centres), 1)),
-                batched_positions=section.centres,
-                batched_colors=batch_colours((1 - share) * SELDOM + share * OFTEN),
-                opacity=0.65,
-                lod="off",
-                cast_shadow=False,
-            )
-        )
-    view.overlays["workspace"] = nodes
 
 
 SELECTED: Rgb = (0, 190, 220)  # outline, slider and card of the link; red means collision only

@@ -126,11 +126,6 @@ class RobotView:
         for shape in self._shapes("visual"):
             shape.handle.opacity = None if opacity >= 1 else opacity
 
-    def cast_no_shadow(self) -> None:
-        """Let the visual shapes cast no shadow."""
-        for shape in self._shapes("visual"):
-            shape.handle.cast_shadow = False
-
     def paint_red(self, names: Collection[str]) -> None:
         """Paint the named links red, and the other links in their own colours."""
         if (names := frozenset(names)) == self.red:
@@ -141,12 +136,6 @@ class RobotView:
                     for shape in shapes:
                         shape.handle.color = RED if link.name in names else shape.colour
         self.red = names
-
-    def paint(self, layer: Layer, colours: Mapping[str, Rgb]) -> None:
-        """Set the colours of a layer's shapes, by link."""
-        for link, shapes in zip(self.robot.links, self.layers.get(layer, []), strict=False):
-            for shape in shapes if link.name in colours else ():
-                shape.handle.color = shape.colour = colours[link.name]
 
     def show_axes(self, visible: bool) -> None:
         """Show or hide the frame of every link."""
