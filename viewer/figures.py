@@ -1,4 +1,4 @@
-"""Figures of pages: tables, maps and heat maps of similarities."""
+"""Similarities of robots on pages: a table, and a map as SVG."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from html import escape
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
@@ -18,19 +18,9 @@ from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address
 
 SIDE_COLOURS = {"train": "#1c7ed6", "test": "#f76707"}
-_WIDTH = 480  # width of an SVG in its own units
 _MAP_WIDTH, _MAP_CELL, _MAP_LABEL = 900.0, (100.0, 95.0), 18
 """Width of a map, width and height of a robot with its name, and letters of a name that fit."""
 _MIN_COLUMNS, _MAP_ASPECT = 9, 2.5  # columns of a map of few robots, and columns by rows
-_BLUES = ((247, 251, 255), (107, 174, 214), (8, 48, 107))  # white to dark blue
-
-
-def blend(stops: ArrayLike, share: float) -> tuple[int, int, int]:
-    """Return the colour at a share in [0, 1] of a scale of three colours."""
-    colours = np.asarray(stops, dtype=float)
-    channels = [np.interp(share, (0.0, 0.5, 1.0), colours[:, k]) for k in range(3)]
-    red, green, blue = (int(channel) for channel in channels)
-    return red, green, blue
 
 
 def map_svg(
@@ -61,7 +51,10 @@ def map_svg(
             f'y="{y * height + 0.75 * inner + 1.1 * label:.1f}" fill="{colour}">'
             f"{escape(name[:_MAP_LABEL])}</text></g></a>"
         )
-    return _svg(rows * height + label, "".join(marks), _MAP_WIDTH)
+    return (
+        f'<svg viewBox="0 0 {_MAP_WIDTH:.0f} {rows * height + label:.0f}" width="100%" '
+        f'style="font-family:inherit">{"".join(marks)}</svg>'
+    )
 
 
 def map_cells(points: Array) -> NDArray[np.intp]:
@@ -74,30 +67,6 @@ def map_cells(points: Array) -> NDArray[np.intp]:
     cells = np.stack(np.divmod(np.arange(rows * columns), columns)[::-1], axis=1)
     _, chosen = linear_sum_assignment(cdist(wanted, cells, "sqeuclidean"))
     return np.asarray(cells[chosen])
-
-
-def heatmap_svg(values: Array, names: Sequence[str], sides: Sequence[str], *, larger: bool) -> str:
-    """Return a square for each pair of robots with its value (n, n), dark if they are similar."""
-    n = len(names)
-    left, cell = 120.0, (_WIDTH - 120.0) / max(n, 1)
-    # Robots compared with themselves would stretch the scale.
-    pairs = values[~np.eye(n, dtype=bool)] if n > 1 else values.ravel()
-    low, high = float(pairs.min()), float(pairs.max())
-    parts = []
-    for i, (name, side) in enumerate(zip(names, sides, strict=True)):
-        parts.append(
-            f'<text x="{left - 4}" y="{(i + 0.65) * cell:.1f}" font-size="{min(10.0, cell):.1f}" '
-            f'text-anchor="end" fill="{SIDE_COLOURS[side]}">{escape(name[:22])}</text>'
-        )
-        for j, other in enumerate(names):
-            share = (values[i, j] - low) / (high - low) if high > low else 1.0
-            share = min(max(share if larger else 1 - share, 0.0), 1.0)
-            parts.append(
-                f'<rect x="{left + j * cell:.1f}" y="{i * cell:.1f}" width="{cell:.2f}" '
-                f'height="{cell:.2f}" fill="rgb{blend(_BLUES, share)}">'
-                f"<title>{escape(name)} and {escape(other)}: {values[i, j]:.3f}</title></rect>"
-            )
-    return _svg(n * cell + 4, "".join(parts))
 
 
 def similarity_table(names: Sequence[str], similarity: Mapping[str, Array]) -> str:
@@ -114,10 +83,3 @@ def similarity_table(names: Sequence[str], similarity: Mapping[str, Array]) -> s
         for i, j in combinations(range(len(names)), 2)
     ]
     return markup.table(header, rows, range(1, len(header)))
-
-
-def _svg(height: float, content: str, width: float = _WIDTH) -> str:
-    return (
-        f'<svg viewBox="0 0 {width:.0f} {height:.0f}" width="100%" '
-        f'style="font-family:inherit">{content}</svg>'
-    )

@@ -78,18 +78,6 @@ def parse_derivation(text: str, origin: str = "derivation") -> Derivation:
     return derivation
 
 
-def outline(derivation: Derivation) -> str:
-    """Return the derivation with one indented line per part."""
-    return "\n".join(_outline(derivation, "", 0))
-
-
-def _outline(node: Derivation, port: str, depth: int) -> Iterator[str]:
-    alone = Derivation(node.label, node.part, node.parameters)
-    yield "  " * depth + (f"{port}: " if port else "") + str(alone)
-    for name, child in node.children:
-        yield from _outline(child, name, depth + 1)
-
-
 @lru_cache(maxsize=1)
 def _parser() -> Lark:
     return Lark(_SYNTAX, parser="lalr", start="node", maybe_placeholders=False)  # linear

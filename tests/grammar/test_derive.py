@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from helpers.grammars import LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError, MorphgenError
-from morphgen.grammar.derivation import Derivation, outline, parse_derivation
+from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.derive import (
     Chooser,
     RandomChooser,
@@ -228,11 +228,6 @@ def test_printing_and_parsing_a_derivation_round_trips(tree):
 def test_invalid_derivations_are_errors_with_a_position(text):
     with pytest.raises(GrammarError, match=r"^card:1:\d+: invalid derivation"):
         parse_derivation(text, "card")
-
-
-def test_an_outline_has_one_line_per_part():
-    tree = parse_derivation("base=fixed[top: arm=ur5[flange: ee=plane(size=0.1)]]")
-    assert outline(tree) == "base=fixed\n  top: arm=ur5\n    flange: ee=plane(size=0.1)"
 
 
 def derived(text):

@@ -5,7 +5,6 @@ from urllib.parse import unquote
 import pytest
 
 from helpers.viser_client import PlainClient
-from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
@@ -128,16 +127,6 @@ def test_a_value_is_replaced_and_the_default_is_left_out():
     words = "base=fixed arm=arm3 arm.length=0.2"
     assert changed(words, "arm.length", "") == "base=fixed arm=arm3"
     assert changed(words, "arm.length", "0.4") == "base=fixed arm=arm3 arm.length=0.4"
-
-
-def test_derivation_is_built_part_by_part():
-    derivation, name = parse_words(WORDS.split(), LIBRARY)
-    whole = list(derivation.walk())
-    for n in range(1, len(whole) + 1):
-        partial = pages.first_parts(derivation, n)
-        assert [node.label for node in partial.walk()] == [node.label for node in whole[:n]]
-        assert compose(partial, LIBRARY, name).links
-    assert pages.first_parts(derivation, 99) == derivation
 
 
 @pytest.mark.parametrize("words", [WORDS, "base=planar ee=cube", "arm=arm3 ee=claw ee.mount_yaw=1"])

@@ -22,7 +22,7 @@ from morphgen.model.robot import Link, Robot
 from morphgen.splits.split_file import find_split, read_split
 from morphgen.viewer.app.address import AddressError, parse_address
 from morphgen.viewer.controls import all_roles, joint_roles
-from morphgen.viewer.figures import heatmap_svg, map_svg, similarity_table
+from morphgen.viewer.figures import map_svg, similarity_table
 from morphgen.viewer.pages import population as populations
 from morphgen.viewer.pages.gallery import parse_range
 from morphgen.viewer.pages.population import (
@@ -166,21 +166,11 @@ def test_a_page_says_which_value_of_its_address_it_leaves_out(shared_viewer, que
         client.shows("30 robots · page 1 of 2")
 
 
-def test_an_empty_gallery_names_the_condition_that_excludes_all(shared_viewer):
+def test_an_empty_gallery_says_why(shared_viewer):
     query = "?gallery=robots/prims&search=lost&findings=without"
     with PlainClient(shared_viewer.port, query) as client:
         client.shows("No robot passes the filter")
-        client.shows("<td >search: lost</td><td >no robot of 30</td>")
-
-
-@pytest.mark.slow
-def test_conditions_are_cleared_from_an_empty_gallery(see):
-    page = see("?gallery=robots/prims&search=lost&dof=1..2")
-    page.get_by_text("No robot passes the filter").wait_for()
-    page.locator("tr", has_text="search: lost").get_by_text("clear").click()
-    page.locator(".card").first.wait_for()
-    page.wait_for_function("!location.search.includes('search')")
-    assert page.failures == []
+        client.shows("0 of 30 robots")
 
 
 @pytest.fixture
@@ -427,9 +417,6 @@ def test_figures_link_to_robots_and_escape_names():
     assert 'href="?robot=x%20y"' in text
     assert "&lt;a&gt;" in text
     assert "<a>" not in text.replace("<a href", "")
-    heatmap = heatmap_svg(np.array([[1.0, 0.3], [0.3, 1.0]]), names, sides, larger=True)
-    assert heatmap.count("<rect") == 4
-    assert "b and &lt;a&gt;: 0.300" in heatmap
 
 
 @pytest.mark.parametrize(
@@ -465,9 +452,6 @@ def test_split_page_shows_both_sides_the_map_and_the_audit(see):
     page.get_by_text("Cosine of test to train").wait_for()
     page.get_by_role("tab", name="Audit").click()
     page.get_by_text("Nearest train robots").wait_for()
-    page.get_by_role("tab", name="Similarity").click()
-    page.locator("svg rect:has(> title)").first.wait_for()
-    assert page.locator("svg rect:has(> title)").count() == 144
     page.get_by_role("tab", name="Map").click()
     point = page.locator("svg a", has=page.locator("title", has_text="chain-000001"))
     point.first.wait_for()

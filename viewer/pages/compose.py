@@ -8,7 +8,6 @@ import shlex
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ from morphgen.errors import CompositionError, MorphgenError
 from morphgen.formats.bundle import bundle_folder, split_colours, write_bundle
 from morphgen.formats.rounding import format_number
 from morphgen.grammar.compose import compose
-from morphgen.grammar.derivation import Derivation, outline, parse_derivation
+from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.derive import Chooser, derive
 from morphgen.grammar.grammar_file import SUFFIX, grammar_from_text, grammar_names, grammar_text
 from morphgen.grammar.library import Library
@@ -335,7 +334,6 @@ class GrammarTab(ComposingTab):
         gui = session.client.gui
         self._source, self._name, self._original = source, "", ""
         self._is_drawn = False  # whether the robot is drawn by seed and number, or the typical one
-        self._derivation: Derivation | None = None  # the whole robot's; fewer parts may be shown
         with tabs.add_tab("Grammar", viser.Icon.BINARY_TREE):
             # A grammar may also be one of a file.
             start = gui.add_dropdown("start from", tuple(dict.fromkeys((source, *grammar_names()))))
@@ -346,9 +344,6 @@ class GrammarTab(ComposingTab):
             self._seed = gui.add_number("seed", 0, min=0, step=1)
             self._number = gui.add_number("robot number", 0, min=0, step=1)
             buttons = gui.add_button_group("robot", ("typical", "this", "next"))
-            hint = "how much of the derivation is shown"
-            self._num_parts = gui.add_slider("parts shown", 1, 2, 1, 1, hint=hint)
-            self._tree = gui.add_html("")
         self._load(source)
         session.on_change(start, lambda: self._start_from(start.value))
         session.on_change(self._text, self.show, "grammar")
@@ -356,7 +351,6 @@ class GrammarTab(ComposingTab):
         session.on_change(
             save, lambda: session.send_file(f"{self._name}{SUFFIX}", self._text.value.encode())
         )
-        session.on_change(self._num_parts, self._show_parts, "parts")
         session.keep(
             "text", self._write_text, lambda text: set_value(self._text, unpack_text(text))
         )
@@ -413,11 +407,6 @@ class GrammarTab(ComposingTab):
             command = f"morphgen sample {name} -n {number + 1} --seed {seed}"
         if is_edited:
             command = f"# with the text of the tab Grammar in {name}\n{command}"
-        self._derivation = derivation
-        n = sum(1 for _ in derivation.walk())
-        self._num_parts.max = max(n, 2)  # a slider needs a range
-        set_value(self._num_parts, n)
-        self._show_tree(derivation, n)
         return Shown(robot, derivation, command, f"{DERIVATION}{derivation}", self._source)
 
     def _show_fault(self, text: str) -> None:
@@ -440,32 +429,6 @@ class GrammarTab(ComposingTab):
             set_value(self._number, self._number.value + 1)
         self._is_drawn = action != "typical"
         self.show()
-
-    def _show_parts(self) -> None:
-        """Show the robot with the number of parts that the slider gives."""
-        if self._derivation is None:
-            return
-        partial = first_parts(self._derivation, self._num_parts.value)
-        self._show_tree(self._derivation, self._num_parts.value)
-        robot = compose(partial, self._library, self._name)
-        uri = f"{DERIVATION}{partial}"
-        self._show_robot(Shown(robot, partial, f"# {partial}", uri, self._source))
-
-    def _show_tree(self, derivation: Derivation, n: int) -> None:
-        lines = [escape(line) for line in outline(derivation).splitlines()]
-        lines[n:] = [f'<span class="dim">{line}</span>' for line in lines[n:]]
-        self._tree.content = markup.framed(f"<h3>Derivation</h3><pre>{'<br>'.join(lines)}</pre>")
-
-
-def first_parts(derivation: Derivation, n: int) -> Derivation:
-    """Return a derivation of only the first ``n`` parts (at least 1), in order of attachment."""
-    kept_ids = {id(node) for node in list(derivation.walk())[: max(n, 1)]}
-
-    def prune(node: Derivation) -> Derivation:
-        children = ((port, prune(child)) for port, child in node.children if id(child) in kept_ids)
-        return replace(node, children=tuple(children))
-
-    return prune(derivation)
 
 
 ROBOTS = "robots"  # folder in which bundles are written

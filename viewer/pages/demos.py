@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from html import escape
+
 from morphgen.errors import MorphgenError
 from morphgen.viewer import markup
+from morphgen.viewer.app.address import Address
 from morphgen.viewer.app.session import Session, set_value
 from morphgen.viewer.controls import bind
+from morphgen.viewer.episode import Episode
 from morphgen.viewer.pages.gallery import show_index
-from morphgen.viewer.pages.play import PANEL_WIDTH, PlayPage, describe_episode
+from morphgen.viewer.pages.play import PANEL_WIDTH, PlayPage
 from morphgen.viewer.robot_uri import uri_name
 from morphgen.viewer.rollout import EpisodeSource, simulation
 
@@ -78,3 +82,16 @@ def show(session: Session) -> None:
     else:
         play()  # says that there is no such episode
     page.add_downloads()
+
+
+def describe_episode(episode: Episode) -> str:
+    """Return a table about a recorded episode, with links to its robots."""
+    rows = [
+        ("task", escape(episode.task) + (" with obstacles" if episode.obstacles else "")),
+        ("policy", escape(episode.policy)),
+        ("seed", str(episode.seed)),
+        ("simulator", escape(episode.simulator)),
+    ]
+    for track in episode.tracks:
+        rows.append(("robot", markup.link(Address("robot", (track.uri,)), track.robot.name)))
+    return markup.table(("recorded", ""), rows)

@@ -40,11 +40,13 @@ class Gallery:
     thumbnails: dict[str, str] = field(default_factory=dict)  # thumbnails drawn so far, by URI
     faults: dict[str, str] = field(default_factory=dict)  # errors of unreadable robots, by URI
     controls: dict[str, Any] = field(default_factory=dict)  # controls by their key in the address
-    empty: str = ""  # HTML in place of the cards if no robot passes the filter
     grid: viser.GuiHtmlHandle | None = None
     summary: str = ""  # number of robots that pass the filter, and of the page
     page_rows: list[robot_rows.Row] = field(default_factory=list)  # robots on the current page
     page_number: int = 1
+
+
+EMPTY = "<h3>No robot passes the filter</h3>"  # HTML in place of the cards
 
 
 def card(row: robot_rows.Row, thumbnail: str, fault: str) -> str:
@@ -84,7 +86,7 @@ def draw_cards(gallery: Gallery) -> None:
         for role, cards in columns.items()
     ]
     summary = f'<div class="dim" style="padding:.6em 0">{gallery.summary}</div>'
-    content = f'<div class="columns">{"".join(html)}</div>' if gallery.page_rows else gallery.empty
+    content = f'<div class="columns">{"".join(html)}</div>' if gallery.page_rows else EMPTY
     shown = markup.framed(summary, content)
     if gallery.session.width > NARROW:
         gallery.grid.content = shown
@@ -115,33 +117,6 @@ def add_filter(gallery: Gallery) -> None:
         for fact in robot_rows.NUMBERS:
             _add_range(gallery, fact)
         _add_dropdown(gallery, "size", "On a page", tuple(map(str, robot_rows.PAGE_SIZES)))
-
-
-def clear_filter(gallery: Gallery, key: str) -> None:
-    """Let every robot pass a condition of the filter, or all conditions without a key."""
-    for name in (key,) if key else robot_rows.FILTERS:
-        if (control := gallery.controls.get(name)) is None:
-            continue
-        if name in robot_rows.NUMBERS:
-            control.value = (control.min, control.max)
-        else:
-            control.value = "" if name == "search" else _ALL
-
-
-def empty_text(gallery: Gallery) -> str:
-    """Return what excludes all robots, as HTML with links that clear each condition."""
-    lines = []
-    for key, value in gallery.session.state().items():
-        if key not in robot_rows.FILTERS or not value:
-            continue
-        alone = sum(robot_rows.passes(row, {key: value}) for row in gallery.rows)
-        count = "no robot" if not alone else "1 robot" if alone == 1 else f"{alone} robots"
-        name = _LABELS.get(key, key)
-        clear = f'<a data-do="clear filter" data-value="{key}">clear</a>'
-        lines.append((escape(f"{name}: {value}"), f"{count} of {len(gallery.rows)}", clear))
-    table = markup.table(("condition", "passed by", ""), lines)
-    clear = '<a data-do="clear filter" data-value="">clear all</a>'
-    return f"<h3>No robot passes the filter</h3>{table}<p>{clear}</p>"
 
 
 def parse_range(fact: str, text: str, limits: tuple[float, float] | None) -> tuple[float, float]:
@@ -317,14 +292,9 @@ def add_controls(gallery: Gallery) -> None:
     def turn_page() -> None:
         show_page(gallery, _PAGE_BUTTONS[buttons.value](gallery.page_number))
 
-    def clear(key: str) -> None:
-        clear_filter(gallery, key)
-        show_page(gallery, 1)
-
     for control in gallery.controls.values():
         session.on_change(control, lambda: show_page(gallery, 1), "filter")
     session.on_change(buttons, turn_page)
-    session.actions["clear filter"] = clear
     show_page(gallery, gallery.page_number)
 
 
@@ -339,7 +309,6 @@ def show_page(gallery: Gallery, number: int) -> None:
     total = "" if len(rows) == len(gallery.rows) else f" of {len(gallery.rows)}"
     noun = gallery.noun if len(gallery.rows) == 1 else f"{gallery.noun}s"
     gallery.summary = f"{len(rows)}{total} {noun} · page {gallery.page_number} of {count}"
-    gallery.empty = "" if rows else empty_text(gallery)
     load_bundle_pictures(gallery, gallery.page_rows)
     draw_cards(gallery)
 

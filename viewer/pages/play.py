@@ -357,19 +357,6 @@ def score_table(episode: Episode, step: int) -> str:
     return head + markup.table(header, rows, (1, 2))
 
 
-def describe_episode(episode: Episode) -> str:
-    """Return a table about a recorded episode, with links to its robots."""
-    rows = [
-        ("task", escape(episode.task) + (" with obstacles" if episode.obstacles else "")),
-        ("policy", escape(episode.policy)),
-        ("seed", str(episode.seed)),
-        ("simulator", escape(episode.simulator)),
-    ]
-    for track in episode.tracks:
-        rows.append(("robot", markup.link(Address("robot", (track.uri,)), track.robot.name)))
-    return markup.table(("recorded", ""), rows)
-
-
 PLOT_INTERVAL = 0.25  # time between two updates of the curves [s]
 COLOURS = (
     *("#1c7ed6", "#f76707", "#2f9e44", "#ae3ec9", "#e03131"),

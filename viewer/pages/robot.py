@@ -320,7 +320,6 @@ GIZMO = "drag the tool"
 _SHOW_OVERLAY: Mapping[str, Callable[[scene_robot.RobotView], None]] = {
     "joint axes": scene_overlays.show_joint_axes,
     "centres of mass": scene_overlays.show_mass_centres,
-    "ignored pairs": scene_overlays.show_ignored_pairs,
     "names": scene_overlays.show_names,
 }
 TOGGLES = (*scene_robot.LAYERS, "x-ray", "frames", *_SHOW_OVERLAY, "workspace", GIZMO)
@@ -357,8 +356,6 @@ class Layers:
 
     def follow(self) -> None:
         """Draw what depends on the robot's configuration."""
-        if self._is_on("ignored pairs"):
-            scene_overlays.show_ignored_pairs(self._view)
         if self._robot.tool:
             T_root_tool = kinematics.frame_pose(self._robot, self._page.q)
             if self._gizmo is not None and not self._is_dragging:

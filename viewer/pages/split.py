@@ -14,7 +14,7 @@ from morphgen.splits.split import SIDES, Split, split_id
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address
 from morphgen.viewer.app.session import Session
-from morphgen.viewer.figures import heatmap_svg, map_svg
+from morphgen.viewer.figures import map_svg
 from morphgen.viewer.pages import gallery as gallery_page
 from morphgen.viewer.robot_rows import split_rows
 from morphgen.viewer.robot_uri import member_uri, resolve_split
@@ -56,10 +56,8 @@ def show(session: Session) -> None:
     texts = {}
     with panel.add_tab("Map", viser.Icon.MAP):
         panel.visible = True  # on a narrow window, too
-        texts["map"] = gui.add_html(markup.framed(markup.dim("the robots are being compared")))
-    with tabs.add_tab("Similarity", viser.Icon.GRID_DOTS):
         measure = gui.add_dropdown("measure", tuple(MEASURES), initial_value="tree")
-        texts["heatmap"] = gui.add_html("")
+        texts["map"] = gui.add_html(markup.framed(markup.dim("the robots are being compared")))
     with tabs.add_tab("Statistics", viser.Icon.TABLE):
         texts["statistics"] = gui.add_html(markup.framed(statistics_table(split.statistics)))
     with tabs.add_tab("Audit", viser.Icon.STETHOSCOPE):
@@ -165,10 +163,4 @@ def _draw_map(page: SplitPage) -> None:
             f"{markup.tag('train', 'train')}{markup.tag('test', 'test')} click a robot"
         ),
         map_svg(plane.points, names, sides, uris, page.gallery.thumbnails),
-    )
-    larger = measure.larger_is_more_alike
-    direction = "larger" if larger else "smaller"
-    page.texts["heatmap"].content = markup.framed(
-        markup.dim(f"dark is more similar; {direction} is more similar"),
-        heatmap_svg(values, names, sides, larger=larger),
     )

@@ -36,7 +36,7 @@ def shell(points: Array) -> Triangles:
     return vertices.astype(np.float32), faces.astype(np.uint32)
 
 
-_ORANGE, _BLUE, _GREY, _BLACK = (247, 103, 7), (25, 113, 194), (134, 142, 150), (33, 37, 41)
+_ORANGE, _BLUE, _BLACK = (247, 103, 7), (25, 113, 194), (33, 37, 41)
 _SHELL: Rgb = (76, 110, 245)
 _NAME_DISTANCE = 0.045  # distance below which links share a label, in extents of the robot
 
@@ -82,25 +82,6 @@ def show_mass_centres(view: RobotView) -> None:
         for i, inertial in inertials.items()
         if inertial.mass > 0
     ]
-
-
-def show_ignored_pairs(view: RobotView) -> None:
-    """Draw a line between the centres of mass of links whose contacts are ignored."""
-    remove_overlay(view, "ignored pairs")
-    centres = np.array([_centre(link) for link in view.robot.links])
-    rotations, origins = view.T_root_link[:, :3, :3], view.T_root_link[:, :3, 3]
-    points = np.einsum("nij,nj->ni", rotations, centres) + origins
-    index = view.robot.link_index
-    lines = [
-        (points[index[a]], points[index[b]])
-        for a, b in view.robot.ignore_pairs
-        if a in index and b in index
-    ]
-    if lines:
-        node = view.scene.add_line_segments(
-            f"{view.name}/ignored", np.array(lines), _GREY, thickness=2.0, thickness_units="screen"
-        )
-        view.overlays["ignored pairs"] = [node]
 
 
 def show_names(view: RobotView) -> None:
