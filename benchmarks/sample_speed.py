@@ -29,7 +29,7 @@ from tabulate import tabulate
 from morphgen.grammar import compose, robot_set, sampling
 from morphgen.grammar import values as conditions
 from morphgen.grammar.grammar_file import find_grammar, grammar_text, load_grammar
-from morphgen.grammar.robot_set import SetConfig, make_in_processes, make_set
+from morphgen.grammar.robot_set import SetConfig, make_set
 from morphgen.progress import show_progress
 
 P = ParamSpec("P")
@@ -111,7 +111,7 @@ def _measure(plan: SetConfig, n: int, jobs: int) -> Run:
         _warm(plan)
     start = time.perf_counter()
     with show_progress(watch):
-        make_set(plan, n, make_in_processes(jobs))
+        make_set(plan, n, jobs)
     return Run(time.perf_counter() - start, early, _peak())
 
 
@@ -123,7 +123,7 @@ def _shares(plan: SetConfig, n: int) -> list[tuple[str, float, str]]:
     _warm(plan)
     clock.spent.clear()
     start = time.perf_counter()
-    make_set(plan, n, make_in_processes())
+    make_set(plan, n)
     total = time.perf_counter() - start
     clock.spent["everything else"] = total - sum(clock.spent.values())
     return [
@@ -157,9 +157,7 @@ class _Clock:
 
 
 def _warm(plan: SetConfig) -> None:
-    make_set(
-        replace(plan, folder=plan.folder.with_name(f"{plan.folder.name}w")), 3, make_in_processes()
-    )
+    make_set(replace(plan, folder=plan.folder.with_name(f"{plan.folder.name}w")), 3)
 
 
 def _content(folder: Path) -> dict[str, bytes]:

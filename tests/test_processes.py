@@ -15,7 +15,7 @@ import pytest
 
 from helpers.worker_functions import be_idle, die, die_at_three, fail, power
 from morphgen.errors import BenchmarkError, MorphgenError
-from morphgen.processes import CHUNK_SIZE, parallel_map
+from morphgen.processes import CHUNK_SIZE, parallel_map, ray_cluster, require_ray
 from morphgen.progress import interrupts, own_progress, part_of, report, show_progress
 
 
@@ -29,6 +29,25 @@ def test_results_come_in_order(jobs, n):
     assert counts == [(i + 1, n) for i in range(n)]
     elsewhere = {process for _, process in results} - {os.getpid()}
     assert bool(elsewhere) == (jobs > 1 and n > CHUNK_SIZE)
+
+
+def test_ray_without_its_package_or_a_cluster_is_an_error(monkeypatch):
+    pytest.importorskip("ray")
+    with (
+        pytest.raises(MorphgenError, match=r"no Ray cluster at '127\.0\.0\.1:1': .*refused"),
+        ray_cluster("127.0.0.1:1"),
+    ):
+        pass
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MorphgenError, match=r"pip install 'morphgen\[ray\]'"):
+        require_ray()
+
+
+@pytest.mark.slow
+def test_the_error_of_a_task_of_ray_is_its_cause():
+    ray = pytest.importorskip("ray")
+    with pytest.raises(BenchmarkError, match="20 is wrong"), ray_cluster(None):
+        ray.get(ray.remote(fail).remote(20))
 
 
 @pytest.mark.parametrize("jobs", [1, 2])

@@ -20,12 +20,7 @@ from morphgen.grammar.grammar_file import (
     grammar_text,
     load_grammar,
 )
-from morphgen.grammar.robot_set import (
-    SetConfig,
-    make_in_processes,
-    make_on_ray,
-    make_set,
-)
+from morphgen.grammar.robot_set import SetConfig, make_set
 from morphgen.grammar.syntax import COUNT_DIGITS, MAX_COUNT
 from morphgen.grammar.values import parse_conditions
 
@@ -108,9 +103,8 @@ def sample(args: argparse.Namespace) -> None:
         not args.no_picture,
         tuple(args.library),
     )
-    work = make_in_processes(args.jobs) if args.ray is None else make_on_ray(args.ray or None)
     with bar(args, "sampling", total=args.n):
-        report = make_set(config, args.n, work)
+        report = make_set(config, args.n, args.jobs)
 
     def summary() -> str:
         lines = [f"{folder}: {report.made} robots written, {report.kept} already existed"]

@@ -14,13 +14,11 @@ from __future__ import annotations
 import json
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import msgspec
@@ -39,7 +37,7 @@ from morphgen.grammar.library import Library, default_library
 from morphgen.grammar.sampling import Sample, sample_robot
 from morphgen.grammar.syntax import MAX_TEXT, Expression, parse_condition
 from morphgen.model.robot import Robot
-from morphgen.processes import CHUNK_SIZE, parallel_map, ray_cluster, require_ray
+from morphgen.processes import parallel_map
 from morphgen.progress import own_progress
 
 INDEX = "index.jsonl"
@@ -49,8 +47,6 @@ DERIVATION = "derivation.txt"
 JOURNAL = ".journal.jsonl"
 
 Record = dict[str, Any]  # a line of the index
-SetWorker = Callable[["SetConfig", Sequence[int]], Iterator[Record]]
-"""Makes the robots of the given indices, in any order."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +84,8 @@ class SetReport:
     """Robots with the derivation of an earlier one: (name, name of the earlier one)."""
 
 
-def make_set(config: SetConfig, n: int, work: SetWorker) -> SetReport:
-    """Make the robots 0 to n - 1 of a set, except those that exist.
+def make_set(config: SetConfig, n: int, jobs: int = 1) -> SetReport:
+    """Make the robots 0 to n - 1 of a set, except those that exist, in ``jobs`` processes.
 
     A set that fails before its first robot is deleted: its folder may hold the set of a corrected
     grammar.
@@ -100,7 +96,7 @@ def make_set(config: SetConfig, n: int, work: SetWorker) -> SetReport:
     begin_folder(config.folder / SETTINGS, config.settings(), "set", first=first)
     _require_same_grammar(config)
     try:
-        return _make_robots(config, n, work)
+        return _make_robots(config, n, jobs)
     except MorphgenError:
         for folder in new_folders:
             with suppress(OSError):  # it has robots
@@ -108,7 +104,7 @@ def make_set(config: SetConfig, n: int, work: SetWorker) -> SetReport:
         raise
 
 
-def _make_robots(config: SetConfig, n: int, work: SetWorker) -> SetReport:
+def _make_robots(config: SetConfig, n: int, jobs: int) -> SetReport:
     with locked_folder(config.folder), own_progress() as show:
         finished = _finished(config)
         missing = [i for i in range(n) if i not in finished]
@@ -117,7 +113,8 @@ def _make_robots(config: SetConfig, n: int, work: SetWorker) -> SetReport:
         try:
             with naming(path), path.open("a", encoding="utf-8") as journal:
                 journal.write("\n")  # ends a line that an interruption cut short
-                for made, record in enumerate(work(config, missing), 1):
+                records = parallel_map(RobotMaker(config).make, missing, jobs)
+                for made, record in enumerate(records, 1):
                     journal.write(json.dumps(record) + "\n")
                     journal.flush()  # a killed run keeps what it has made
                     show(n - len(missing) + made, n)
@@ -153,10 +150,6 @@ class RobotMaker:
         else:
             write_bundle(sample.robot, folder, sample.findings, picture=config.picture)
         return _record(sample)
-
-    def make_all(self, indices: Sequence[int]) -> list[Record]:
-        """Draw and write several robots."""
-        return [self.make(index) for index in indices]
 
 
 def read_index(folder: Path) -> list[Record]:
@@ -283,36 +276,3 @@ def _write_index(config: SetConfig, made: int, kept: int) -> SetReport:
         if first != record["name"]:
             duplicates.append((record["name"], first))
     return SetReport(made, kept, dict(rejected), duplicates)
-
-
-def make_in_processes(jobs: int = 1) -> SetWorker:
-    """Return a worker that makes robots in ``jobs`` processes; one is this process."""
-
-    def work(config: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
-        return parallel_map(RobotMaker(config).make, indices, jobs)
-
-    return work
-
-
-def make_on_ray(address: str | None) -> SetWorker:
-    """Return a worker that makes robots on a Ray cluster that shares the set's folder."""
-    ray = require_ray()
-
-    def work(config: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
-        if not indices:
-            return
-        with ray_cluster(address):
-            absolute = replace(config, folder=config.folder.resolve())
-            yield from _distribute(ray, absolute, indices)
-
-    return work
-
-
-def _distribute(ray: ModuleType, config: SetConfig, indices: Sequence[int]) -> Iterator[Record]:
-    """Start a maker on every CPU, and give each the next chunk when it is free."""
-    chunks = [indices[i : i + CHUNK_SIZE] for i in range(0, len(indices), CHUNK_SIZE)]
-    cpus = max(int(ray.cluster_resources().get("CPU", 1)), 1)
-    remote = ray.remote(num_cpus=1)(RobotMaker)
-    makers = ray.util.ActorPool([remote.remote(config) for _ in range(min(cpus, len(chunks)))])
-    for records in makers.map_unordered(lambda maker, chunk: maker.make_all.remote(chunk), chunks):
-        yield from records

@@ -87,13 +87,6 @@ def test_sample_reports_duplicate_robots(ok):
     assert line.endswith("one-000003 as one-000000, ...")
 
 
-def test_ray_option_without_the_package_is_rejected(refused, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "ray", None)
-    assert "--ray needs the package ray: pip install 'morphgen[ray]'" in refused(
-        "sample", "cubes", "--ray"
-    )
-
-
 def test_grammar_list_names_the_categories(run):
     rows = json.loads(run("grammar", "list", "--json")[1])
     assert [row["name"] for row in rows] == CATEGORIES

@@ -22,7 +22,7 @@ from morphgen.checks import check
 from morphgen.checks.conformance import conformance
 from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.bundle import read_bundle, write_bundle
-from morphgen.grammar import sampling
+from morphgen.grammar import robot_set, sampling
 from morphgen.grammar.analysis import check_grammar, count_structures
 from morphgen.grammar.derive import RandomChooser, derive
 from morphgen.grammar.grammar_file import grammar_from_text, grammar_text
@@ -31,9 +31,8 @@ from morphgen.grammar.robot_set import (
     INDEX,
     JOURNAL,
     SETTINGS,
+    RobotMaker,
     SetConfig,
-    make_in_processes,
-    make_on_ray,
     make_set,
     read_index,
 )
@@ -207,7 +206,7 @@ def plan(folder, category="cubes", **changes):
 def whole(tmp_path):
     """A set of eight cubes."""
     config = plan(tmp_path / "whole")
-    make_set(config, 8, make_in_processes())
+    make_set(config, 8)
     return config.folder
 
 
@@ -218,19 +217,27 @@ def test_a_set_that_fails_before_its_first_robot_leaves_nothing(exists, tmp_path
     if exists:
         folder.mkdir(parents=True)
     with pytest.raises(SamplingError, match=r"failed at: where .reach > 50"):
-        make_set(plan(folder, where=("reach > 50",)), 2, make_in_processes())
+        make_set(plan(folder, where=("reach > 50",)), 2)
     assert [path.name for path in tmp_path.rglob("*")] == ["new", "set"] * exists
-    assert make_set(plan(folder), 1, make_in_processes()).made == 1
+    assert make_set(plan(folder), 1).made == 1
+
+
+def stopped(config, n, done, error):
+    """Make a set whose drawing raises an error after some robots."""
+
+    def limited(make, indices, jobs):
+        yield from map(make, indices[:done])
+        raise error
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(robot_set, "parallel_map", limited)
+        with pytest.raises(type(error)):
+            make_set(config, n)
 
 
 def test_a_set_that_fails_later_keeps_its_robots(tmp_path):
-    def work(config, indices):
-        yield from make_in_processes()(config, indices[:1])
-        raise SamplingError("no more")
-
-    with pytest.raises(SamplingError, match="no more"):
-        make_set(plan(tmp_path / "set"), 2, work)
-    report = make_set(plan(tmp_path / "set"), 2, make_in_processes())
+    stopped(plan(tmp_path / "set"), 2, 1, SamplingError("no more"))
+    report = make_set(plan(tmp_path / "set"), 2)
     assert (report.made, report.kept) == (1, 1)
 
 
@@ -240,12 +247,7 @@ def interrupted(plan, n, done):
     class Killed(BaseException):
         pass
 
-    def work(plan, indices):
-        yield from make_in_processes()(plan, indices[:done])
-        raise Killed
-
-    with pytest.raises(Killed):
-        make_set(plan, n, work)
+    stopped(plan, n, done, Killed())
 
 
 def test_a_light_set_has_one_folder_per_robot_an_index_and_the_grammar(whole):
@@ -270,16 +272,16 @@ def test_the_index_has_one_json_line_per_robot(whole):
 
 
 def test_a_full_set_consists_of_bundles(tmp_path):
-    make_set(plan(tmp_path / "s", light=False), 1, make_in_processes())
+    make_set(plan(tmp_path / "s", light=False), 1)
     files = {path.name for path in (tmp_path / "s" / "cubes-000000").iterdir()}
     assert {"card.json", "robot.urdf", "robot.xml"} <= files
 
 
 def test_progress_reaches_the_number_of_robots(tmp_path):
     seen = []
-    for n, work in ((3, make_in_processes()), (5, make_in_processes(2))):
+    for n, jobs in ((3, 1), (5, 2)):
         with show_progress(lambda *now: seen.append(now)):
-            make_set(plan(tmp_path / "s"), n, work)
+            make_set(plan(tmp_path / "s"), n, jobs)
     assert seen == [(0, 3), (1, 3), (2, 3), (3, 3), (3, 5), (4, 5), (5, 5)]
 
 
@@ -288,18 +290,18 @@ def test_two_processes_write_the_same_bytes_as_one(tmp_path, light):
     one = plan(tmp_path / "one", "chain", light=light)
     two = replace(one, folder=tmp_path / "two")
     n = 20 if light else 3
-    make_set(one, n, make_in_processes())
-    make_set(two, n, make_in_processes(2))
+    make_set(one, n)
+    make_set(two, n, 2)
     assert tree(one.folder) == tree(two.folder)
 
 
 def test_a_larger_set_contains_the_smaller_one(tmp_path, whole):
     config = plan(tmp_path / "s")
-    assert make_set(config, 3, make_in_processes()).made == 3
-    report = make_set(config, 8, make_in_processes())
+    assert make_set(config, 3).made == 3
+    report = make_set(config, 8)
     assert (report.made, report.kept) == (5, 3)
     assert tree(config.folder) == tree(whole)
-    assert make_set(config, 2, make_in_processes()).made == 0
+    assert make_set(config, 2).made == 0
     assert tree(config.folder) == tree(whole)
 
 
@@ -309,7 +311,7 @@ def test_robots_written_before_an_interruption_are_kept(tmp_path, whole, done):
     interrupted(config, 8, done)
     with pytest.raises(FormatError, match=r"is not a finished set: it has no index\.jsonl"):
         read_index(config.folder)
-    report = make_set(config, 8, make_in_processes())
+    report = make_set(config, 8)
     assert (report.made, report.kept, report.duplicates) == (8 - done, done, [])
     assert tree(config.folder) == tree(whole)
 
@@ -318,11 +320,11 @@ def test_deleted_robots_are_regenerated(tmp_path, whole):
     before = tree(whole)
     shutil.rmtree(whole / "cubes-000003")
     (whole / "cubes-000005" / "robot.urdf").unlink()
-    report = make_set(plan(whole), 8, make_in_processes())
+    report = make_set(plan(whole), 8)
     assert (report.made, report.kept) == (2, 6)
     assert tree(whole) == before
     (whole / INDEX).unlink()  # and there is no journal
-    assert make_set(plan(whole), 8, make_in_processes()).made == 8
+    assert make_set(plan(whole), 8).made == 8
     assert tree(whole) == before
 
 
@@ -333,7 +335,7 @@ def test_a_truncated_journal_regenerates_one_robot(tmp_path, whole, cut):
     lines = (config.folder / JOURNAL).read_text().splitlines()
     (config.folder / JOURNAL).write_text("".join(f"{x}\n" for x in lines[:4]) + lines[4][:cut])
     interrupted(config, 8, 2)
-    report = make_set(config, 8, make_in_processes())
+    report = make_set(config, 8)
     assert report.made in (2, 3)
     assert tree(config.folder) == tree(whole)
 
@@ -343,7 +345,7 @@ def test_partially_written_robots_are_removed(tmp_path, whole):
     interrupted(config, 8, 2)
     (config.folder / ".cubes-000002.x1y2").mkdir()
     (config.folder / ".cubes-000002.x1y2" / "robot.urdf").write_text("<robot")
-    make_set(config, 8, make_in_processes())
+    make_set(config, 8)
     assert tree(config.folder) == tree(whole)
 
 
@@ -354,7 +356,7 @@ def test_a_folder_interrupted_before_the_first_robot_can_be_continued(tmp_path, 
     for name in left:
         path = config.folder / name
         path.write_text(config.grammar_text) if name == GRAMMAR else path.mkdir()
-    make_set(config, 8, make_in_processes())
+    make_set(config, 8)
     assert tree(config.folder) == tree(whole)
 
 
@@ -374,7 +376,7 @@ def test_a_killed_run_resumes_to_the_same_bytes(tmp_path, jobs):
     again = start(*words, "--out", tmp_path / "killed")
     out, err = again.communicate(timeout=60)
     assert (again.returncode, "20 made" in out) == (0, False), err
-    make_set(plan(tmp_path / "whole", "chain", seed=3), 20, make_in_processes())
+    make_set(plan(tmp_path / "whole", "chain", seed=3), 20)
     assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
 
 
@@ -397,7 +399,7 @@ def test_a_killed_run_resumes_to_the_same_bytes(tmp_path, jobs):
 def test_a_set_is_continued_only_with_the_same_settings(whole, change, message):
     before = tree(whole)
     with pytest.raises(FormatError) as caught:
-        make_set(plan(whole, **change), 9, make_in_processes())
+        make_set(plan(whole, **change), 9)
     assert message in str(caught.value)
     assert tree(whole) == before
 
@@ -408,13 +410,13 @@ def test_a_folder_with_other_files_or_a_file_is_an_error(tmp_path, name):
         (tmp_path / "s").mkdir()
     (tmp_path / "s" / name).write_text("mine")
     with pytest.raises(FormatError, match=r"and is not a set \(no set\.json\); name another"):
-        make_set(plan(tmp_path / "s"), 1, make_in_processes())
+        make_set(plan(tmp_path / "s"), 1)
     assert (tmp_path / "s" / name).read_bytes() == b"mine"
 
 
 def test_duplicate_robots_are_reported(tmp_path):
     config = plan(tmp_path / "s", grammar_name="g", grammar_text="robot -> cubes\n")
-    report = make_set(config, 3, make_in_processes())
+    report = make_set(config, 3)
     assert report.duplicates == [("g-000001", "g-000000"), ("g-000002", "g-000000")]
     hashes = {record["hash"] for record in read_index(config.folder)}
     assert len(hashes) == 1
@@ -422,39 +424,38 @@ def test_duplicate_robots_are_reported(tmp_path):
 
 def test_rejected_draws_are_counted_over_the_whole_set(tmp_path):
     config = plan(tmp_path / "s", where=("mass < 0.5 and dof == 2",))
-    report = make_set(config, 8, make_in_processes())
+    report = make_set(config, 8)
     counted = sum(sum(record["rejected"].values()) for record in read_index(config.folder))
     assert report.rejected == {"where (mass < 0.5)": counted}
     assert counted > 0
-    assert make_set(config, 8, make_in_processes()).rejected == report.rejected
+    assert make_set(config, 8).rejected == report.rejected
 
 
-@pytest.mark.parametrize(
-    "work", [make_in_processes(), make_in_processes(2)], ids=["1 job", "2 jobs"]
-)
-def test_an_unsatisfiable_condition_stops_the_run(tmp_path, work):
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_unsatisfiable_condition_stops_the_run(tmp_path, jobs):
     message = "0 of 'cubes': 0 of 500 draws were accepted; 500 failed at: where (mass > 900)"
     with pytest.raises(SamplingError, match=re.escape(message)):
-        make_set(plan(tmp_path / "s", where=("mass > 900",)), 4, work)
+        make_set(plan(tmp_path / "s", where=("mass > 900",)), 4, jobs)
 
 
 def test_a_light_robot_references_meshes_in_their_packages(tmp_path):
     config = plan(tmp_path / "s", grammar_name="g", grammar_text="robot -> fixed ur5\n")
-    make_set(config, 1, make_in_processes())
+    make_set(config, 1)
     text = (config.folder / "g-000000" / "robot.urdf").read_text()
     assert 'filename="package://' in text
     assert str(Path.home()) not in text
 
 
-def test_a_concurrent_run_in_the_same_folder_is_an_error(tmp_path):
-    config = plan(tmp_path / "set")
+def test_a_concurrent_run_in_the_same_folder_is_an_error(tmp_path, monkeypatch):
+    config, make = plan(tmp_path / "set"), RobotMaker.make
 
-    def work(plan, indices):
+    def make_beside(self, index):
         with pytest.raises(FormatError, match="is being written by another run"):
-            make_set(plan, 8, make_in_processes())
-        yield from make_in_processes()(plan, indices)
+            make_set(config, 8)
+        return make(self, index)
 
-    make_set(config, 2, work)
+    monkeypatch.setattr(RobotMaker, "make", make_beside)
+    make_set(config, 2)
     assert len(read_index(config.folder)) == 2
 
 
@@ -480,7 +481,7 @@ def test_an_invalid_index_line_is_an_error(whole, change):
 @pytest.mark.parametrize("line", ["[" * 100_000, "[]", "null", "5", "{}"])
 def test_an_invalid_journal_is_ignored(whole, line):
     (whole / JOURNAL).write_text(line + "\n")
-    assert make_set(plan(whole), 9, make_in_processes()).made == 1
+    assert make_set(plan(whole), 9).made == 1
     assert len(read_index(whole)) == 9
     (whole / INDEX).write_text(line + "\n")
     with pytest.raises(FormatError, match=r"index.jsonl:1: not a line of an index"):
@@ -492,33 +493,4 @@ def test_invalid_settings_are_errors(whole, text):
     (whole / SETTINGS).write_text(text)
     reasons = "(invalid JSON|is nested deeper|expected the settings)"
     with pytest.raises(FormatError, match=f"set.json: {reasons}"):
-        make_set(plan(whole), 9, make_in_processes())
-
-
-@pytest.fixture(scope="module")
-def address():
-    """Address of a cluster of two nodes with one process each."""
-    from ray.cluster_utils import Cluster
-
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
-    cluster.add_node(num_cpus=1)
-    cluster.wait_for_nodes()
-    yield cluster.address
-    cluster.shutdown()
-
-
-@pytest.mark.slow
-def test_a_ray_cluster_writes_the_same_bytes_as_one_process(address, tmp_path):
-    make_set(plan(tmp_path / "serial"), 40, make_in_processes())
-    report = make_set(plan(tmp_path / "ray"), 40, make_on_ray(address))
-    assert report.made == 40
-    assert tree(tmp_path / "ray") == tree(tmp_path / "serial")
-    with pytest.raises(SamplingError, match="0 of 500 draws") as refused:
-        make_set(plan(tmp_path / "set", where=("mass > 1000",)), 4, make_on_ray(address))
-    assert "Traceback" not in str(refused.value)
-
-
-@pytest.mark.slow
-def test_an_address_without_a_cluster_is_an_error(tmp_path):
-    with pytest.raises(MorphgenError, match=r"no Ray cluster at '127\.0\.0\.1:1': .*refused"):
-        make_set(plan(tmp_path / "set"), 4, make_on_ray("127.0.0.1:1"))
+        make_set(plan(whole), 9)

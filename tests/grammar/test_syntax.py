@@ -33,7 +33,7 @@ from morphgen.grammar.grammar_file import (
 )
 from morphgen.grammar.manifest import UNITS
 from morphgen.grammar.request import parse_request, pin
-from morphgen.grammar.robot_set import SetConfig, make_in_processes, make_set
+from morphgen.grammar.robot_set import SetConfig, make_set
 from morphgen.grammar.sampling import sample_robots
 from morphgen.grammar.syntax import (
     Expression,
@@ -544,7 +544,7 @@ def test_the_index_has_the_documented_fields(tmp_path):
     (row,) = re.findall(r"\| `index\.jsonl` \| one line per robot: (.*?) \|", PAGE)
     named = set(row.replace("rejected draws", "rejected").split(", "))
     plan = SetConfig(tmp_path / "s", "g", "robot -> cubes\n", 0, (), True, False, ())
-    make_set(plan, 1, make_in_processes())
+    make_set(plan, 1)
     record = json.loads((tmp_path / "s" / "index.jsonl").read_text())
     assert set(record) - {"index"} == named
 

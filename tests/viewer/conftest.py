@@ -9,7 +9,7 @@ from helpers.robots import arm
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.grammar_file import find_grammar, grammar_text, load_grammar
 from morphgen.grammar.library import default_library
-from morphgen.grammar.robot_set import SetConfig, make_in_processes, make_set
+from morphgen.grammar.robot_set import SetConfig, make_set
 from morphgen.viewer.app.app import serve
 from morphgen.viewer.robot_uri import FileAccess
 
@@ -57,7 +57,7 @@ def folder(tmp_path_factory):
     plan = SetConfig(
         root / "robots" / "prims", "prims", grammar_text(grammar), 0, (), True, False, ()
     )
-    make_set(plan, 30, make_in_processes())
+    make_set(plan, 30)
     write_bundle(arm(), root / "robots" / "some-arm", picture=False)
     broken = write_bundle(arm(), root / "robots" / "broken", picture=False)
     text = (broken / "robot.urdf").read_text()

@@ -656,7 +656,7 @@ class PopulationPage:
 
 def summary(source: Source, population: Population, faults: Sequence[tuple[str, str]]) -> str:
     """Return the number of robots, what is missing, and how to use the pointer."""
-    text = f"<h3>{len(population)} robots</h3>"
+    text = f"<h3>{len(population)} robot{'s' * (len(population) != 1)}</h3>"
     if source.total > len(source.rows):
         text += markup.dim(f"the first {len(source.rows)} of {source.total}")
     if faults:
