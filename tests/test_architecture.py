@@ -211,9 +211,7 @@ MISSING = {
     **{"fit ur5": "fit", "compose arm=ur5 --geometry convex": "convex", 'fit("z1")': "fit"},
     **{"export prims --format usd": "usd", "view": "viewer", "finetune zero-shot": "rl"},
     **{"train interpolation/arm3/reach": "rl", 'train("prims task=reach")': "rl"},
-    **dict.fromkeys(
-        ("play reach prims", "speed reach prims", 'make_env("reach", "prims")'), "tasks"
-    ),
+    **dict.fromkeys(("play reach prims", 'make_env("reach", "prims")'), "tasks"),
 }
 """Extra that a command, or a call of ``import morphgen``, needs."""
 TRIED_WITHOUT = """

@@ -1,4 +1,4 @@
-"""``morphgen check`` and ``morphgen conform``: findings about robots, and agreement of loaders."""
+"""``morphgen check``, ``conform`` and ``export``: findings, agreement of loaders, other formats."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 
 from morphgen import checks
 from morphgen.api.checks import bundle_of, check_source, conform_source
@@ -15,6 +16,7 @@ from morphgen.cli import options as opt
 from morphgen.cli.progress import note
 from morphgen.errors import FormatError, one_line
 from morphgen.formats.bundle import bundle_folder, write_bundle
+from morphgen.formats.files import require_writable_folder
 from morphgen.formats.urdf.read import UnsoundError
 from morphgen.grammar.library import Library
 from morphgen.grammar.robot_source import RobotReference, read_source
@@ -184,3 +186,21 @@ def _cell(value: str | bool | float | None) -> str:
             return value[:_MAX_CELL]
         case _:
             return f"{value:.2g}"
+
+
+def export(args: argparse.Namespace) -> int:
+    """Write a file or a folder for each robot."""
+    from morphgen.api.export import write_export  # seconds to import
+
+    if args.out is not None:
+        require_writable_folder(args.out)
+    given, paths = SimpleNamespace(**vars(args)), list[Path]()
+
+    def write(source: RobotReference, library: Library) -> None:
+        paths.append(write_export(source, read_source(source, library, args.root), given, paths))
+
+    _, refused = opt.for_each_robot(args, "exporting", write)
+    refusals = [{"robot": label, **error} for label, error in refused.items()]
+    data = [*map(str, paths), *refusals]
+    opt.print_result(args, data, lambda: "\n".join(map(str, paths)))
+    return 2 if refused else 0

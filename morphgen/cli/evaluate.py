@@ -1,4 +1,4 @@
-"""``morphgen eval``, ``play``, ``zeroshot`` and ``speed``: run policies and controllers."""
+"""``morphgen eval``, ``play`` and ``zeroshot``: run policies and controllers."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import argparse
 import itertools
 import math
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import replace
 
 from morphgen.api import evaluation
@@ -21,11 +20,9 @@ from morphgen.rl.scores import Score, require_table, success_of
 from morphgen.rl.shipped_policies import checkpoint_path, zero_shot_policy
 from morphgen.tables import table
 from morphgen.tasks.reach import GOAL_KINDS
-from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, TASKS
 from morphgen.tasks.render.renderer import require_video_path
-from morphgen.tasks.scenes.make import make_batch
-from morphgen.tasks.sim.base import CONTROL_PERIOD, SUBSTEPS
-from morphgen.tasks.speed import measure_speed
+from morphgen.tasks.sim.base import CONTROL_PERIOD
 
 
 def evaluate(args: argparse.Namespace) -> None:
@@ -59,36 +56,6 @@ def play(args: argparse.Namespace) -> None:
         evaluation.play(robot=robot, show=report, **opt.arguments(args, evaluation.play))
     if args.out is not None:
         print_line(str(args.out))
-
-
-def speed(args: argparse.Namespace) -> None:
-    """Measure the speed and print it."""
-    robot, sim = " ".join(args.words), args.sim or DEFAULT_SIMULATOR
-    workers = args.workers or SIMULATORS[sim].default_workers(args.envs)
-    with bar(args, f"preparing {robot} and its goals"):
-        batch = make_batch(
-            args.task,
-            [robot],
-            args.envs,
-            sim=sim,
-            workers=workers,
-            device=args.device or SIMULATORS[sim].devices[0],
-            obstacles=args.obstacles,
-            max_links=None,
-            library=args.library,
-        )
-    with closing(batch), status(args, "measuring"):
-        steps_per_second = measure_speed(batch, args.seconds)
-
-    def text() -> str:
-        return (
-            f"{args.task}, {batch.specs[0].robot.name}, {args.envs} environments, {sim}, "
-            f"{batch.device.type}, {workers} worker(s)\n"
-            f"environment steps per second: {steps_per_second:,.0f}\n"
-            f"physics steps per second:     {SUBSTEPS * steps_per_second:,.0f}"
-        )
-
-    opt.print_result(args, {"steps_per_second": steps_per_second}, text)
 
 
 FILM_EPISODES = 3  # number of episodes in a video

@@ -11,7 +11,6 @@ import pytest
 
 from helpers.commands import start, tree
 from helpers.runs import NETWORK, ROLLOUT, RUN, SMALL, small_split
-from helpers.simulators import PYBULLET
 from helpers.splits import member, split
 from morphgen.benchmark.scores.submission import read_table
 from morphgen.cli import progress
@@ -431,22 +430,6 @@ def test_episodes_differ_and_are_reproducible(run):
     assert outs[0] == outs[1] != outs[2]
     first, second = parse_episodes(outs[0])
     assert first[2:] != second[2:]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sim", [PYBULLET, "mujoco", "kinematic"])
-def test_speed_prints_rates(sim, ok):
-    words = ["speed", "reach", "arm3", "--envs", "2", "--seconds", "0.05", "--sim", sim]
-    facts = json.loads(ok(*words, "--json"))
-    assert facts["steps_per_second"] > 0
-    text = ok(*words)
-    assert f"reach, arm3, 2 environments, {sim}, cpu, 1 worker(s)" in text
-    assert "physics steps per second" in text
-
-
-def test_robots_above_the_default_max_links_can_be_measured(ok):
-    words = ["speed", "reach", "chain", "beads=7", "--envs", "1", "--seconds", "0.05"]
-    assert "reach, chain" in ok(*words, "--sim", "mujoco")
 
 
 @pytest.mark.parametrize("name", POLICIES.builtin)

@@ -22,9 +22,8 @@ from morphgen.model.robot import Link, Robot
 from morphgen.splits.split_file import find_split, read_split
 from morphgen.viewer.app.address import AddressError, parse_address
 from morphgen.viewer.controls import all_roles, joint_roles
-from morphgen.viewer.figures import map_svg, similarity_table
 from morphgen.viewer.pages import population as populations
-from morphgen.viewer.pages.gallery import parse_range
+from morphgen.viewer.pages.gallery import make_member, parse_range, save_split
 from morphgen.viewer.pages.population import (
     ReadRobot,
     compare_robots,
@@ -32,12 +31,13 @@ from morphgen.viewer.pages.population import (
     make_population,
     read_robots,
     shape_poses,
+    similarity_table,
 )
+from morphgen.viewer.pages.split import map_svg
 from morphgen.viewer.robot_rows import Row
 from morphgen.viewer.robot_uri import FileAccess, UriError, member_uri, read_robot_uri
 from morphgen.viewer.scene.robot import robot_bounds
 from morphgen.viewer.scene.stage import View, fit_camera, project_points
-from morphgen.viewer.splits import make_member, save_split
 
 
 def test_cards_of_a_gallery_lead_to_their_robots(shared_viewer):

@@ -23,7 +23,7 @@ PAGES: Mapping[str, str] = {
     "compare": "morphgen.viewer.pages.population:show_compared",
     "split": "morphgen.viewer.pages.split:show",
     "play": "morphgen.viewer.pages.play:show",
-    "demos": "morphgen.viewer.pages.demos:show",
+    "demos": "morphgen.viewer.pages.play:show_demos",
 }
 """The function that builds each page, by the page's key in the address (``?robot=...``)."""
 

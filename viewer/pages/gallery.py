@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import dataclass, field, replace
+from functools import partial
 from html import escape
+from pathlib import Path
 from typing import Any
 
 import viser
 
-from morphgen.errors import MorphgenError
+from morphgen.encoding.robot_hash import robot_hash
+from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.bundle import PICTURE
+from morphgen.grammar.compose import compose
+from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.grammar_file import grammar_names
 from morphgen.rl.demonstrations.lerobot import RECORDING
-from morphgen.splits.split import SIDES
-from morphgen.splits.split_file import split_names
+from morphgen.splits.split import COMPOSED, HOLD_OUT, REGIMES, SIDES, Member, Regime, Split
+from morphgen.splits.split_file import require_split_name, split_names, write_split
+from morphgen.tasks.registry import TASKS
 from morphgen.viewer import markup, robot_rows
 from morphgen.viewer.app.address import Address, AddressError, parse_count
 from morphgen.viewer.app.frame import call
@@ -24,8 +31,15 @@ from morphgen.viewer.app.uploads import store_upload
 from morphgen.viewer.app.workers import WorkerDied
 from morphgen.viewer.controls import bind
 from morphgen.viewer.robot_files import Thumbnail, make_thumbnail, thumbnail_of_picture
-from morphgen.viewer.robot_uri import DEFAULT_WORDS, FileAccess
-from morphgen.viewer.splits import SPLITS, add_split_form
+from morphgen.viewer.robot_uri import (
+    DEFAULT_WORDS,
+    MEMBER,
+    FileAccess,
+    read_robot_uri,
+    resolve_derivation,
+    resolve_member,
+    shorten,
+)
 
 
 @dataclass(eq=False)
@@ -401,6 +415,73 @@ def show_chosen(session: Session) -> None:
 
 def _set_sides(rows: list[robot_rows.Row], num_train: int) -> None:
     rows[:] = [replace(row, role=SIDES[int(i >= num_train)]) for i, row in enumerate(rows)]
+
+
+REGIMES_TO_SAVE = tuple(regime for regime in REGIMES if regime != HOLD_OUT)
+"""Regimes of splits that the viewer saves; it has no controls for what a hold-out split says."""
+SPLITS = "splits"  # folder in which new splits are written
+MAX_NAME = 200  # longest name of a split [characters]
+
+
+def make_member(task: str, obstacles: bool, files: FileAccess, row: robot_rows.Row) -> Member:
+    """Return the robot of a row as a member of a split. Runs in a worker."""
+    uri = row.uri
+    if uri.startswith(MEMBER):
+        return replace(resolve_member(uri, files), task=task, obstacles=obstacles)
+    robot = read_robot_uri(uri, files)
+    derivation = str(resolve_derivation(uri, files) or robot.provenance.get("derivation", ""))
+    if not derivation:
+        raise BenchmarkError(f"{uri} was imported: a split names robots by their derivations")
+    composed = compose(parse_derivation(derivation), files.library, robot.name)
+    hash_ = robot_hash(composed)
+    return Member(robot.name, row.category or COMPOSED, derivation, task, obstacles, hash_)
+
+
+def save_split(
+    name: str, regime: Regime, train: Sequence[Member], test: Sequence[Member], files: FileAccess
+) -> Path:
+    """Write a split's file into ``splits/`` of the folder where the viewer was started."""
+    require_split_name(name)
+    if not train or not test:
+        raise BenchmarkError(
+            f"{len(train)} train and {len(test)} test robots: at least one of each is needed"
+        )
+    if len(name) > MAX_NAME:
+        raise BenchmarkError(f"name {shorten(name)!r}: at most {MAX_NAME} characters")
+    path = files.roots[0] / SPLITS / f"{name}.yaml"
+    if path.exists():
+        raise BenchmarkError(f"{path} exists; choose another name")
+    summary = f"{len(train)} robots to train on, {len(test)} to test on, chosen in the viewer"
+    write_split(Split(name, regime, summary, tuple(train), tuple(test)), path)
+    return path
+
+
+def add_split_form(
+    session: Session, choose_sides: Callable[[], tuple[list[robot_rows.Row], list[robot_rows.Row]]]
+) -> None:
+    """Add controls that save a new split for a task, and show the command that audits it.
+
+    The function returns the robots to train on and those to test on.
+    """
+    gui = session.client.gui
+    with gui.add_folder("New split"):
+        name = gui.add_text("split name", "")
+        regime = gui.add_dropdown("regime", REGIMES_TO_SAVE)
+        task = gui.add_dropdown("task", tuple(TASKS))
+        obstacles = gui.add_checkbox("obstacles", False)
+        text = gui.add_html("")
+        button = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
+
+    def save() -> None:
+        make = partial(make_member, task.value, obstacles.value, session.files)
+        with session.activity("composing {} robots"):
+            train, test = (list(session.workers.map(make, rows)) for rows in choose_sides())
+        path = save_split(name.value, regime.value, train, test, session.files)
+        shown = str(path.relative_to(session.files.roots[0]))
+        text.content = markup.framed(markup.code(f"morphgen split audit {shlex.quote(shown)}"))
+        session.notify("Saved", shown)
+
+    session.on_press(button, save)
 
 
 INDEX_WIDTH = 620.0  # width of the panel [pixels]

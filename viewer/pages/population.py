@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,6 @@ from morphgen.viewer.app.address import MAX_COMPARED, Address, parse_count
 from morphgen.viewer.app.session import Session
 from morphgen.viewer.app.workers import Workers
 from morphgen.viewer.controls import RoleSliders, all_roles, bind, joint_roles
-from morphgen.viewer.figures import similarity_table
 from morphgen.viewer.pages.gallery import show_index
 from morphgen.viewer.robot_files import robot_facts
 from morphgen.viewer.robot_rows import (
@@ -703,6 +703,22 @@ def compare_robots(robots: Sequence[Robot], folders: Sequence[Path]) -> dict[str
         features(robot, token_shapes(robot, folders), max_links=max_links) for robot in robots
     ]
     return {name: similarity_matrix(compared, name) for name in MEASURES}
+
+
+def similarity_table(names: Sequence[str], similarity: Mapping[str, Array]) -> str:
+    """Return a table with a row for each pair of robots and a column for each measure."""
+    header = [""]
+    for name, measure in MEASURES.items():
+        direction = "larger" if measure.larger_is_more_alike else "smaller"
+        header.append(f"{name} ({direction} is more similar)")
+    rows = [
+        (
+            f"{escape(names[i])} and {escape(names[j])}",
+            *(f"{similarity[name][i, j]:.3f}" for name in MEASURES),
+        )
+        for i, j in combinations(range(len(names)), 2)
+    ]
+    return markup.table(header, rows, range(1, len(header)))
 
 
 def format_selection(selected: NDArray[np.bool_]) -> str:

@@ -2,27 +2,61 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from html import escape
+from pathlib import Path
 
+import numpy as np
 import viser
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
 
-from morphgen.benchmark.audit import Audit
+from morphgen.benchmark.audit import Audit, audit_survey
+from morphgen.benchmark.survey import (
+    Fault,
+    SurveyedRobot,
+    compare_members,
+    different_members,
+    summarize_survey,
+    survey_robot,
+)
 from morphgen.encoding.similarity import MEASURES, classical_mds, to_distances
-from morphgen.splits.split import SIDES, Split, split_id
+from morphgen.errors import BenchmarkError
+from morphgen.grammar.library import Library
+from morphgen.splits.split import SIDES, Member, Side, Split, sided_members, split_id
+from morphgen.typing import Array
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address
 from morphgen.viewer.app.session import Session
-from morphgen.viewer.figures import map_svg
+from morphgen.viewer.app.workers import Workers
 from morphgen.viewer.pages import gallery as gallery_page
 from morphgen.viewer.robot_rows import split_rows
 from morphgen.viewer.robot_uri import member_uri, resolve_split
-from morphgen.viewer.splits import SplitStudy, study_split
 
 PANEL_WIDTH = 520.0  # largest width of the controls [pixels]
 PANEL_SHARE = 0.36  # largest share of the window for the controls: names on the map stay readable
+MAX_ROBOTS = 60  # robots of which every pair is compared; a map of more could not be read
 NUM_PLAYED = 4  # test robots of the link to a rollout
+
+
+SIDE_COLOURS = {"train": "#1c7ed6", "test": "#f76707"}
+_MAP_WIDTH, _MAP_CELL, _MAP_LABEL = 900.0, (100.0, 95.0), 18
+"""Width of a map, width and height of a robot with its name, and letters of a name that fit."""
+_MIN_COLUMNS, _MAP_ASPECT = 9, 2.5  # columns of a map of few robots, and columns by rows
+
+
+@dataclass(frozen=True, eq=False)
+class SplitStudy:
+    """Survey of a split's robots."""
+
+    audit: Audit
+    statistics: Mapping[str, object]  # statistics by side; empty if a robot cannot be composed
+    members: tuple[tuple[Side, Member], ...]  # members that can be composed, train robots first
+    matrices: Mapping[str, Array]  # similarity of their pairs by measure, shape (n, n)
 
 
 @dataclass(eq=False)
@@ -164,3 +198,80 @@ def _draw_map(page: SplitPage) -> None:
         ),
         map_svg(plane.points, names, sides, uris, page.gallery.thumbnails),
     )
+
+
+def study_split(split: Split, folders: tuple[Path, ...], workers: Workers) -> SplitStudy:
+    """Measure and compare a split's robots in worker processes."""
+    members = [*split.train, *split.test]
+    if len(members) > MAX_ROBOTS:
+        raise BenchmarkError(
+            f"{len(members)} robots are too many to compare all pairs (at most {MAX_ROBOTS}); "
+            "use morphgen split audit and morphgen split stats"
+        )
+    measure = partial(survey_robot, Library(folders), split.max_links)
+    robots = list(workers.map(measure, different_members(split)))
+    return workers.call(conclude_study, split, robots, folders)
+
+
+def conclude_study(
+    split: Split, robots: Sequence[SurveyedRobot | Fault], folders: tuple[Path, ...]
+) -> SplitStudy:
+    """Compare measured robots, audit the split and compute its statistics. Runs in a worker."""
+    survey = compare_members(split, robots, all_pairs=True)
+    sound = [i for i, each in enumerate(survey.robots) if isinstance(each, SurveyedRobot)]
+    members = sided_members(split)
+    return SplitStudy(
+        audit_survey(survey, Library(folders)),
+        summarize_survey(survey) if len(sound) == len(members) else {},
+        tuple(members[i] for i in sound),
+        {
+            name: survey.similarity[np.ix_(sound, sound, [k])][..., 0]
+            for k, name in enumerate(MEASURES)
+        },
+    )
+
+
+def map_svg(
+    points: Array,
+    names: Sequence[str],
+    sides: Sequence[str],
+    uris: Sequence[str],
+    pictures: Mapping[str, str],
+) -> str:
+    """Return a map of robots at points (n, 2), which show their side; a click opens one."""
+    cells = map_cells(points)
+    columns, rows = (cells.max(axis=0) + 1).tolist()
+    # Many robots make the pictures smaller, never the map larger.
+    width = _MAP_WIDTH / max(columns, _MIN_COLUMNS)
+    height = width * _MAP_CELL[1] / _MAP_CELL[0]
+    inner, label = 0.94 * width, min(13.0, 0.13 * width)
+    marks = []
+    for (x, y), name, side, uri in zip(cells.tolist(), names, sides, uris, strict=True):
+        query, colour = escape(Address("robot", (uri,)).query), SIDE_COLOURS[side]
+        box = f'width="{inner:.1f}" height="{0.75 * inner:.1f}"'
+        at = f'x="{x * width:.1f}" y="{y * height:.1f}"'
+        picture = f'<image {at} {box} href="{pictures[uri]}"/>' if pictures.get(uri) else ""
+        marks.append(
+            f'<a href="{query}"><g><title>{escape(name)} ({side})</title>'
+            f'<rect class="point" {at} {box} rx="4" fill="#fff"/>{picture}'
+            f'<rect {at} {box} rx="4" fill="none" stroke="{colour}" stroke-width="2"/>'
+            f'<text x="{x * width + inner / 2:.1f}" text-anchor="middle" font-size="{label:.1f}" '
+            f'y="{y * height + 0.75 * inner + 1.1 * label:.1f}" fill="{colour}">'
+            f"{escape(name[:_MAP_LABEL])}</text></g></a>"
+        )
+    return (
+        f'<svg viewBox="0 0 {_MAP_WIDTH:.0f} {rows * height + label:.0f}" width="100%" '
+        f'style="font-family:inherit">{"".join(marks)}</svg>'
+    )
+
+
+def map_cells(points: Array) -> NDArray[np.intp]:
+    """Return a cell (column, row) of its own near each point (n, 2); a fifth stay free."""
+    n = len(points)
+    columns = max(_MIN_COLUMNS, round(math.sqrt(_MAP_ASPECT * n)))
+    rows = max(math.ceil(1.25 * n / columns), round(columns / _MAP_ASPECT))
+    span = np.maximum(np.ptp(points, axis=0), 1e-9)
+    wanted = (points - points.min(axis=0)) / span * (columns - 1, 1 - rows) + (0, rows - 1)
+    cells = np.stack(np.divmod(np.arange(rows * columns), columns)[::-1], axis=1)
+    _, chosen = linear_sum_assignment(cdist(wanted, cells, "sqeuclidean"))
+    return np.asarray(cells[chosen])
