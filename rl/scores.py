@@ -7,7 +7,7 @@ import io
 import itertools
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from os import PathLike
 from pathlib import Path
@@ -32,7 +32,6 @@ RESAMPLES = 2000
 MAX_RESAMPLED = 2**26  # largest number of values that are resampled at once: 512 MB
 _MAX_DIGITS = 6
 """Largest number of decimals of a rate's ends, which have as many as tell them apart."""
-TRIM = 0.25  # fraction that the interquartile mean leaves out at each end
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,22 @@ def stratified_mean_interval(strata: Sequence[ArrayLike]) -> Interval:
         values: NDArray[Any] = np.mean([sample.mean(axis=axis) for sample in samples], axis=0)
         return values
 
-    return _interval(mean, tables, statistic, paired=False)
+    if all(np.ptp(samples) == 0 for samples in tables):
+        return Interval(mean, math.nan, math.nan)
+    num_values = sum(len(samples) for samples in tables)
+    interval = scipy.stats.bootstrap(
+        tables,
+        statistic,
+        vectorized=True,
+        n_resamples=RESAMPLES,
+        batch=min(RESAMPLES, max(1, MAX_RESAMPLED // num_values)),
+        confidence_level=LEVEL,
+        method="percentile",
+        random_state=np.random.default_rng(0),
+    ).confidence_interval
+    if interval.low == interval.high:
+        return Interval(mean, math.nan, math.nan)
+    return Interval(mean, float(interval.low), float(interval.high))
 
 
 def mean_interval(seeds: Sequence[Sequence[ArrayLike]], *, together: bool = True) -> Interval:
@@ -148,6 +162,7 @@ def episode_interval(
     successes: Sequence[Sequence[Sequence[bool]]],
     *,
     relative: bool,
+    together: bool = True,
 ) -> Interval:
     """Return the mean over seeds and robots of their mean scores.
 
@@ -156,8 +171,8 @@ def episode_interval(
     """
     pairs = zip(itertools.chain(*scores), itertools.chain(*successes), strict=True)
     if not relative and all(np.array_equal(*pair) for pair in pairs):
-        return seeds_success_interval(successes)
-    return mean_interval(scores)
+        return seeds_success_interval(successes, together=together)
+    return mean_interval(scores, together=together)
 
 
 POWER = 0.8  # probability that a difference shows, by convention
@@ -200,51 +215,6 @@ def mean_error(seeds: Sequence[Sequence[ArrayLike]]) -> float:
         return of_episodes
     means = [np.mean([samples.mean() for samples in strata]) for strata in tables]
     return float(np.fmax(of_episodes, np.std(means, ddof=1) / math.sqrt(len(seeds))))
-
-
-def iqm_interval(scores: ArrayLike, *, together: bool) -> Interval:
-    """Return the interquartile mean of scores (seeds, robots), with a bootstrap over the seeds.
-
-    Robots are the strata: every resample has as many scores of each robot as the original.
-    """
-    table = np.asarray(scores, dtype=np.float64)
-    iqm = float(scipy.stats.trim_mean(table.ravel(), TRIM))
-    if len(table) < 2:
-        return Interval(iqm, math.nan, math.nan)
-
-    def statistic(*strata: NDArray[Any], axis: int = -1) -> NDArray[Any]:
-        values: NDArray[Any] = scipy.stats.trim_mean(
-            np.concatenate(strata, axis=axis), TRIM, axis=axis
-        )
-        return values
-
-    return _interval(iqm, tuple(table.T), statistic, paired=together)
-
-
-def _interval(
-    value: float,
-    samples: tuple[NDArray[np.float64], ...],
-    statistic: Callable[..., Any],
-    *,
-    paired: bool,
-) -> Interval:
-    if all(np.ptp(sample) == 0 for sample in samples):
-        return Interval(value, math.nan, math.nan)
-    num_values = sum(len(sample) for sample in samples)
-    interval = scipy.stats.bootstrap(
-        samples,
-        statistic,
-        paired=paired,
-        vectorized=True,
-        n_resamples=RESAMPLES,
-        batch=min(RESAMPLES, max(1, MAX_RESAMPLED // num_values)),
-        confidence_level=LEVEL,
-        method="percentile",
-        random_state=np.random.default_rng(0),
-    ).confidence_interval
-    if interval.low == interval.high:
-        return Interval(value, math.nan, math.nan)
-    return Interval(value, float(interval.low), float(interval.high))
 
 
 Name = Annotated[str, Meta(min_length=1, max_length=200)]

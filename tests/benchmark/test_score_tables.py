@@ -53,7 +53,6 @@ def test_a_row_has_all_seeds_of_a_method_and_the_difference_to_the_reference():
         assert robots.episodes == trials, side
         assert robots.score.value == pytest.approx(np.mean(scores))
         assert robots.score == mean_interval([[each] * robots.robots for each in scores])
-        assert robots.iqm.low <= robots.iqm.value <= robots.iqm.high
         wilson = success_interval(7 / 8, trials)
         successes = [[[True] * 4] * robots.robots, [[True] * 3 + [False]] * robots.robots]
         of_seeds = mean_interval(successes)

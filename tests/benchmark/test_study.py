@@ -35,7 +35,7 @@ from morphgen.rl.inference import MODES
 from morphgen.rl.runs.checkpoint import CHECKPOINT
 from morphgen.rl.runs.robot_source import members, other_side, split_of, split_source
 from morphgen.rl.runs.training import subruns_of
-from morphgen.rl.scores import UNSTABLE, iqm_interval, relative_scores
+from morphgen.rl.scores import UNSTABLE, mean_interval, relative_scores, seeds_success_interval
 
 pytestmark = pytest.mark.slow
 
@@ -208,8 +208,12 @@ def test_policies_of_single_robots_are_resampled_by_robot(whole):
         own = [stored_results(cell)["deterministic"] for cell in whole if cell.agent == agent]
         (row,) = result_rows({str(each.training_seed): each for each in own})
         train = [[robot for robot in run.robots if robot.side == "train"] for run in own]
-        scores = [[relative_scores(robot).mean() for robot in robots] for robots in train]
-        assert row.sides["train"].iqm == iqm_interval(scores, together=agent != "se")
+        scores = [[relative_scores(robot) for robot in robots] for robots in train]
+        together = agent != "se"
+        assert row.sides["train"].score == mean_interval(scores, together=together)
+        successes = [[robot.success for robot in robots] for robots in train]
+        wanted = seeds_success_interval(successes, together=together)
+        assert row.sides["train"].success == wanted
 
 
 def test_missing_and_diverged_episodes_are_named_under_the_table(whole, tmp_path):

@@ -23,7 +23,7 @@ from morphgen.rl.baselines.simple import Zero
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.inference import make_env_and_controller, play, read_controller, run_episodes
 from morphgen.rl.ppo import Learner, gae, matching_loss, symexp, symlog
-from morphgen.rl.scores import iqm_interval, stratified_mean_interval, success_interval
+from morphgen.rl.scores import stratified_mean_interval, success_interval
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.make import batch_from_specs, make_batch
@@ -488,35 +488,11 @@ def all_resamples(values):
     return [np.mean(chosen) for chosen in product(values, repeat=len(values))]
 
 
-def test_the_interquartile_mean_drops_a_quarter_at_each_end():
-    scores = [[-1000.0, 1.0, 2.0, 3.0], [4.0, 5.0, 6.0, 1000.0]]
-    assert iqm_interval(scores, together=True).value == pytest.approx(np.mean([2, 3, 4, 5]))
-
-
-@pytest.mark.parametrize("together", [True, False])
-def test_the_interval_of_one_robot_contains_95_percent_of_the_resamples(together):
+def test_the_interval_of_one_robot_contains_95_percent_of_the_resamples():
     values = [1.0, 2.0, 4.0]
-    found = iqm_interval(np.array(values)[:, None], together=together)
     low, high = np.quantile(all_resamples(values), (0.025, 0.975), method="inverted_cdf")
+    found = stratified_mean_interval([values])
     assert (found.low, found.high) == pytest.approx((low, high))
-    alone = stratified_mean_interval([values])
-    assert (alone.low, alone.high) == pytest.approx((low, high))
-
-
-def test_resampled_seeds_keep_their_robots_together():
-    # Robots go up and down together: by themselves they make up for each other.
-    scores = np.array([0.0, 1.0, 2.0, 3.0])[:, None] + np.zeros(8)
-    whole, apart = (iqm_interval(scores, together=together) for together in (True, False))
-    assert whole.value == apart.value == pytest.approx(1.5)
-    assert whole.high - whole.low > 2 * (apart.high - apart.low) > 0
-
-
-def test_robots_are_strata_of_the_bootstrap():
-    # Scores differ between robots only: no resample is another.
-    scores = np.tile([1.0, 5.0, 9.0, 100.0], (3, 1))
-    for together in (True, False):
-        found = iqm_interval(scores, together=together)
-        assert (found.value, math.isnan(found.low), math.isnan(found.high)) == (7.0, True, True)
 
 
 def test_the_wilson_interval_stays_within_0_and_1():
@@ -589,8 +565,6 @@ def test_scores_without_a_spread_have_no_interval(scores):
         scoring.episode_interval(
             [scores], [[[False] * len(each) for each in scores]], relative=True
         ),
-        iqm_interval(np.transpose(scores), together=True),
-        iqm_interval(np.array([[1.0] * 15 + [0.9], [1.0] * 15 + [0.8]]), together=True),
     ):
         assert isinstance(found, scoring.Interval)
         assert math.isnan(found.low)

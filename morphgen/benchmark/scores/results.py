@@ -1,7 +1,7 @@
 """Results of submissions, computed from the episodes: tables of seeds, and reference scores.
 
 Scores of several seeds of a method stand in one row, whose intervals resample the seeds: means,
-interquartile means, success rates, and paired differences to a reference controller. Reference
+success rates, and paired differences to a reference controller. Reference
 scores are those of submissions in a release.
 """
 
@@ -44,7 +44,6 @@ from morphgen.rl.scores import (
     RobotOutcomes,
     episode_interval,
     finite_or_none,
-    iqm_interval,
     mean_error,
     mean_interval,
     relative_scores,
@@ -211,7 +210,6 @@ class SideResult:
     episodes: int  # number of episodes of all robots and seeds
     score: Interval  # mean score over seeds and robots; see `episode_interval`
     error: float  # standard error of the mean score; see `mean_error`
-    iqm: Interval  # interquartile mean of the scores of seeds and robots; no interval for one seed
     success: Interval  # mean success rate; see `seeds_success_interval`
     difference: Interval | None
     """Score minus that of the reference in the same episodes, see `mean_interval`; None without a
@@ -335,7 +333,6 @@ def _side_results(
             )
         robots = [name for name in tables[0] if name in names]
         scores = [[relative_scores(table[name], random) for name in robots] for table in tables]
-        means = np.array([[each.mean() for each in own] for own in scores])
         # Policies of single robots are independent samples on the robots that they learned.
         together = not any(_learned_alone(run, side) for run in runs)
         successes = [[table[name].success for name in robots] for table in tables]
@@ -344,9 +341,13 @@ def _side_results(
             SideResult(
                 len(robots),
                 sum(map(len, itertools.chain(*successes))),
-                episode_interval(scores, successes, relative=TASKS[task].relative_to_random),
+                episode_interval(
+                    scores,
+                    successes,
+                    relative=TASKS[task].relative_to_random,
+                    together=together,
+                ),
                 mean_error(scores),
-                iqm_interval(means, together=together),
                 seeds_success_interval(successes, together=together),
                 _difference(
                     tables,
@@ -400,7 +401,7 @@ def rows_data(rows: Sequence[ResultRow]) -> list[Any]:
     return [finite_or_none(asdict(row)) for row in rows]
 
 
-_LESS = ("ZS IQM", "MT IQM", "fine-tuned", "trained", "MT success", "MT mean")
+_LESS = ("fine-tuned", "trained", "MT success", "MT mean")
 """Columns of result tables that a narrow terminal leaves out first."""
 
 
@@ -413,7 +414,7 @@ def result_tables(rows: Sequence[ResultRow], style: str = "simple") -> str:
         headers = ["method", "seeds", "trained", "fine-tuned"]
         for side in SIDES:
             name = SIDE_NAMES[side]
-            headers += [f"{name} mean", f"{name} IQM", f"{name} success", reference]
+            headers += [f"{name} mean", f"{name} success", reference]
         decimals = score_decimals(side.score.value for row in own for side in row.sides.values())
         lines = [_line(row, decimals) for row in own]
         title = split if split.endswith(f"/{task}") else f"{split}: {task}"
@@ -432,11 +433,10 @@ def _line(row: ResultRow, decimals: int) -> list[str]:
     for side in SIDES:
         result = row.sides.get(side)
         if result is None:
-            line += ["-"] * 4
+            line += ["-"] * 3
             continue
         line += [
             result.score.as_text(f".{decimals}f"),
-            result.iqm.as_text(f".{decimals}f"),
             result.success.as_percent(),
             "-" if result.difference is None else result.difference.as_text(f"+.{decimals}f"),
         ]
