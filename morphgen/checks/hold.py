@@ -18,7 +18,7 @@ from morphgen.checks.readers import bullet_client, load_model
 from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.bundle import MJCF, URDF
 from morphgen.formats.quiet import MujocoWarnings, quiet
-from morphgen.model.dynamics import GRAVITY
+from morphgen.model.dynamics import GRAVITY, gravity_load
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import DEFAULT_EFFORT, Robot
 from morphgen.typing import Array
@@ -76,7 +76,18 @@ def _hold(name: str, robot: Robot, positions: Iterator[Array]) -> HoldRow:
     joint = robot.joints[robot.movable_joints[worst]]
     unit = "m" if joint.kind == "prismatic" else "rad"
     message = "" if passed else f"{joint.name} moves {drift[worst]:.3g} {unit}"
+    if not passed:
+        message += "".join(_weak_motors(robot))
     return HoldRow(name, passed, float(drift[worst]), unit, joint.name, message)
+
+
+def _weak_motors(robot: Robot) -> Iterator[str]:
+    """Yield a sentence for each joint whose effort limit is below what holds the weight at home."""
+    loads = abs(robot.mimic_map[0].T @ gravity_load(robot, robot.home)).tolist()
+    for k, load in zip(robot.independent_joints, loads, strict=True):
+        joint = robot.joints[k]
+        if joint.effort and joint.effort < load:  # one of zero counts as missing
+            yield f"; effort {joint.effort:g} of {joint.name} does not hold the load of {load:.3g}"
 
 
 def _mjcf(robot: Robot, folder: Path) -> Iterator[Array]:

@@ -11,7 +11,6 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -471,8 +470,6 @@ def _has_home_pose(robot: Robot) -> bool:
 
 def _gap(a: Sequence[Shape], b: Sequence[Shape], T_a_b: Array) -> float:
     """Return the distance between two solids [m]; below ``MAX_GAP``, perhaps an upper bound."""
-    if _are_primitives_near(a, b, T_a_b):
-        return 0.0
     # Some of the triangles give an upper bound of the distance, which usually suffices. If not,
     # only triangles within this bound of the other solid can be nearer, so test those.
     coarse_b = _transform(_triangles(b, _COARSE_TRIANGLES), T_a_b)
@@ -483,28 +480,6 @@ def _gap(a: Sequence[Shape], b: Sequence[Shape], T_a_b: Array) -> float:
     gap = _distance(all_a[_is_near(all_a, all_b, bound)], all_b[_is_near(all_b, all_a, bound)])
     enclosed = gap > MAX_GAP and (_encloses(all_a, all_b) or _encloses(all_b, all_a))
     return 0.0 if enclosed else gap
-
-
-def _are_primitives_near(a: Sequence[Shape], b: Sequence[Shape], T_a_b: Array) -> bool:
-    """Return whether two primitives are within ``MAX_GAP``.
-
-    A negative answer is not certain, because FCL overestimates distances of some pairs.
-    """
-    import fcl  # here and below, because commands that check no robot should start quickly
-
-    def objects(shapes: Sequence[Shape], T_a_link: Array) -> Iterator[fcl.CollisionObject]:
-        for shape in shapes:
-            if not isinstance(shape.geometry, Mesh):
-                T = T_a_link @ shape.T_link_shape.matrix
-                # FCL has the same primitives, with the same names and dimensions.
-                primitive = getattr(fcl, type(shape.geometry).__name__)
-                transform = fcl.Transform(T[:3, :3], T[:3, 3])
-                yield fcl.CollisionObject(primitive(*dimensions(shape.geometry)), transform)
-
-    return any(
-        fcl.distance(*pair, fcl.DistanceRequest(), fcl.DistanceResult()) <= MAX_GAP
-        for pair in product(objects(a, np.eye(4)), objects(b, T_a_b))
-    )
 
 
 def _triangles(shapes: Sequence[Shape], max_per_shape: int | None = None) -> _Triangles:

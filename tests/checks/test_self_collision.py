@@ -368,6 +368,7 @@ def test_a_motor_that_is_too_weak_lets_go_under_gravity(effort, holds, tmp_path)
     assert (row.passed, row.joint) == (holds, "pivot")
     if not holds:
         assert row.drift > 0.5
+        assert row.message.endswith("; effort 9 of pivot does not hold the load of 9.81")
 
 
 @needs_pybullet

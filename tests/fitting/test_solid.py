@@ -2,14 +2,13 @@
 
 import math
 
-import igl
 import numpy as np
 import pytest
 import trimesh
 
 from morphgen.errors import FitError, MeshError
 from morphgen.fitting import solid as module
-from morphgen.fitting.solid import Solid, _Columns, solid_of, solid_of_mesh
+from morphgen.fitting.solid import solid_of, solid_of_mesh
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere, volume
 
 SIZE = (0.2, 0.3, 0.4)
@@ -84,20 +83,6 @@ def test_the_solid_of_an_l_is_not_its_convex_hull():
     assert solid.method == "watertight"
     assert counted(solid) == pytest.approx(0.014, rel=1e-9)
     assert solid.contains(np.array([(-0.15, 0.1, 0), (0, 0, 0)])).tolist() == [True, False]
-
-
-def test_crossings_of_closed_triangles_give_their_winding_numbers():
-    """The peer sums the solid angles of triangles; the parts overlap, nest and touch."""
-    tilted = box((0.3, 0.1, 0.2)).apply_transform(TILTED.matrix)
-    parts = [angle(), tilted, trimesh.creation.icosphere(3, 0.12), box((0.1,) * 3)]
-    mesh = trimesh.util.concatenate([*parts, box((0.1,) * 3, (0.1, 0, 0), inverted=True)])
-    solid = Solid(mesh, "watertight")
-    points = np.random.default_rng(0).uniform(*mesh.bounds, (20_000, 3))
-    expected = igl.fast_winding_number(mesh.vertices, mesh.faces, points)
-    counted = _Columns(mesh).winding(points)
-    assert {-1, 0, 1, 2, 3} <= {*counted}
-    np.testing.assert_array_equal(counted, expected.round())
-    np.testing.assert_array_equal(solid.contains(points), expected > 0.5)
 
 
 @pytest.mark.parametrize("flipped", [1, 4, 7, 10, 12])
