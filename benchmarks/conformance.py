@@ -32,7 +32,7 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from morphgen.api.checks import conform
-from morphgen.checks.hold import MAX_DRIFT
+from morphgen.checks.conformance import MAX_DRIFT
 from morphgen.formats.bundle import MJCF, write_bundle
 from morphgen.formats.files import write_file
 from morphgen.grammar.compose import compose

@@ -7,8 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from morphgen import checks
-from morphgen.checks.conformance import ConformanceReport, compare, compare_file
-from morphgen.checks.hold import hold_files
+from morphgen.checks.conformance import ConformanceReport, compare, compare_file, hold_files
 from morphgen.checks.rules import home_penetrations
 from morphgen.formats.bundle import CARD, bundle_folder, file_findings, read_bundle, write_bundle
 from morphgen.formats.gate import loader_copy

@@ -1,7 +1,11 @@
-"""Conformance: compare how different loaders read a bundle, or a file as it is.
+"""Conformance: how loaders read a bundle, or a file as it is, and whether its robot holds its home.
 
 The files of a bundle must be read alike by all loaders. A file of others need not be: each loader
 reads it as its own rules say.
+
+To hold its home, MuJoCo simulates ``robot.xml`` with its position actuators and its compensation of
+gravity. PyBullet simulates ``robot.urdf`` with gravity, its own position control and the effort
+limits of the file: a URDF has no controllers, and this is how its users hold a robot.
 """
 
 from __future__ import annotations
@@ -17,16 +21,23 @@ from typing import Any
 import numpy as np
 
 from morphgen.arguments import whole_number
-from morphgen.checks.hold import HoldRow
-from morphgen.checks.readers import LOADERS, NO_LIMITS, Loader, Reading
-from morphgen.errors import FormatError, one_line
-from morphgen.formats.bundle import URDF, read_bundle
+from morphgen.checks.readers import (
+    LOADERS,
+    NO_LIMITS,
+    Loader,
+    Reading,
+    bullet_client,
+    load_model,
+)
+from morphgen.errors import FormatError, MorphgenError, one_line
+from morphgen.formats.bundle import MJCF, URDF, read_bundle
 from morphgen.formats.description import read_description
 from morphgen.formats.gate import loader_copy
+from morphgen.formats.quiet import MujocoWarnings, quiet
 from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS
 from morphgen.model import kinematics
-from morphgen.model.dynamics import actuation, gravity_load, mass_matrix
+from morphgen.model.dynamics import GRAVITY, actuation, gravity_load, mass_matrix
 from morphgen.model.robot import DEFAULT_EFFORT, DEFAULT_VELOCITY, Frame, Joint, Mimic, Robot
 from morphgen.typing import Array
 
@@ -84,6 +95,20 @@ class ConformanceRow:
     product of its two diagonal entries."""
     message: str = ""  # description of the disagreement, or `not installed`
     source: str = BUNDLE  # `bundle`, or `file` if the loader read the file of others as it is
+
+
+@dataclass(frozen=True)
+class HoldRow:
+    """How a robot holds its home configuration in a simulator."""
+
+    simulator: str  # name of the simulator, and of the file
+    passed: bool | None
+    """Whether no joint drifts farther than ``MAX_DRIFT`` from home; None without the simulator."""
+    drift: float | None = None
+    """Largest distance of a joint from home within ``HOLD_S`` [rad or m]; None if diverged."""
+    unit: str = ""  # unit of `drift`: `rad` or `m`
+    joint: str = ""  # name of the joint that drifts farthest
+    message: str = ""  # description of the failure; empty if the robot passed
 
 
 @dataclass(frozen=True)
@@ -367,3 +392,109 @@ def _added_inertia(robot: Robot, q: Array) -> float:
     count = len(robot.links) + len(robot.frames)
     inertia = BOUND_INERTIA + BOUND_MASS * max(1.0, 4 * size**2)
     return float(gains**2 * count * inertia)
+
+
+HOLD_S = 5.0  # duration of holding [s]
+MAX_DRIFT = 0.02  # largest accepted distance of a joint from home while holding [rad or m]
+SOLVER_ITERATIONS = 200
+"""Iterations of PyBullet's constraint solver, as in the simulator of the tasks. With the default of
+50, motors of an arm with a hand of many light joints do not agree: the arm turns on and on."""
+MIN_TIMESTEP = 1e-4  # smallest time step of an MJCF that is simulated [s]: 50,000 steps of holding
+
+
+def hold_files(robot: Robot, folder: Path) -> tuple[HoldRow, ...]:
+    """Hold a robot at home with the files of its bundle in each simulator."""
+    simulators = (("mujoco", "mjcf", _mjcf), ("pybullet", "urdf", _urdf))
+    rows = []
+    for module, file, simulate in simulators:
+        name = f"{module} ({file})"
+        if find_spec(module) is None:
+            rows.append(HoldRow(name, None, message="not installed"))
+        elif not robot.movable_joints:
+            rows.append(HoldRow(name, True, 0.0))
+        else:
+            try:
+                rows.append(_hold(name, robot, simulate(robot, folder)))
+            except MorphgenError as error:
+                rows.append(HoldRow(name, False, message=str(error)))
+    return tuple(rows)
+
+
+def _hold(name: str, robot: Robot, positions: Iterator[Array]) -> HoldRow:
+    """Return the row of a robot whose movable joints are at these positions, shape (n_movable,)."""
+    home = kinematics.movable_positions(robot, robot.home)
+    drift = np.zeros(len(home))
+    for q in positions:
+        if not np.isfinite(q).all():
+            return HoldRow(name, False, message="diverged")
+        drift = np.maximum(drift, np.abs(q - home))
+    worst = int(drift.argmax())
+    passed = bool(drift[worst] <= MAX_DRIFT)
+    joint = robot.joints[robot.movable_joints[worst]]
+    unit = "m" if joint.kind == "prismatic" else "rad"
+    message = "" if passed else f"{joint.name} moves {drift[worst]:.3g} {unit}"
+    if not passed:
+        message += "".join(_weak_motors(robot))
+    return HoldRow(name, passed, float(drift[worst]), unit, joint.name, message)
+
+
+def _weak_motors(robot: Robot) -> Iterator[str]:
+    """Yield a sentence for each joint whose effort limit is below what holds the weight at home."""
+    loads = abs(robot.mimic_map[0].T @ gravity_load(robot, robot.home)).tolist()
+    for k, load in zip(robot.independent_joints, loads, strict=True):
+        joint = robot.joints[k]
+        if joint.effort and joint.effort < load:  # one of zero counts as missing
+            yield f"; effort {joint.effort:g} of {joint.name} does not hold the load of {load:.3g}"
+
+
+def _mjcf(robot: Robot, folder: Path) -> Iterator[Array]:
+    """Yield the positions of the movable joints after each time step of ``HOLD_S``."""
+    import mujoco
+
+    model = load_model(folder / MJCF)
+    names = [model.key(i).name for i in range(model.nkey)]
+    if "home" not in names:
+        raise FormatError("no keyframe 'home'")
+    joints = _joints(robot, {model.joint(i).name: model.jnt_qposadr[i] for i in range(model.njnt)})
+    if not model.opt.timestep >= MIN_TIMESTEP:
+        raise FormatError(
+            f"{MJCF}: timestep {model.opt.timestep:g} s; expected at least {MIN_TIMESTEP:g} s"
+        )
+    # A robot that diverges must be seen.
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, names.index("home"))
+    for _ in range(round(HOLD_S / model.opt.timestep)):
+        with MujocoWarnings():
+            mujoco.mj_step(model, data)
+        yield data.qpos[joints]
+
+
+def _joints(robot: Robot, index: Mapping[str, int]) -> list[int]:
+    names = [robot.joints[k].name for k in robot.movable_joints]
+    if missing := sorted(set(names) - index.keys()):
+        raise FormatError(f"lacks joints {', '.join(missing)}")
+    return [index[name] for name in names]
+
+
+def _urdf(robot: Robot, folder: Path) -> Iterator[Array]:
+    """Yield the positions of the movable joints after each time step of ``HOLD_S``."""
+    with bullet_client() as client:
+        with quiet():
+            body = client.loadURDF(str(folder / URDF), useFixedBase=True)
+        client.setGravity(0, 0, -GRAVITY)
+        client.setPhysicsEngineParameter(numSolverIterations=SOLVER_ITERATIONS)
+        infos = [client.getJointInfo(body, i) for i in range(client.getNumJoints(body))]
+        joints = _joints(robot, {info[1].decode(): info[0] for info in infos})
+        # Item 10 is the effort limit; one of zero counts as missing, as in the MJCF.
+        forces = [infos[joint][10] or DEFAULT_EFFORT for joint in joints]
+        home = kinematics.movable_positions(robot, robot.home).tolist()
+        for joint, q in zip(joints, home, strict=True):
+            client.resetJointState(body, joint, q)
+        client.setJointMotorControlArray(
+            body, joints, client.POSITION_CONTROL, targetPositions=home, forces=forces
+        )
+        period = client.getPhysicsEngineParameters()["fixedTimeStep"]
+        for _ in range(round(HOLD_S / period)):
+            client.stepSimulation()
+            yield np.array([state[0] for state in client.getJointStates(body, joints)])

@@ -12,8 +12,8 @@ import trimesh
 from helpers.composed import composed
 from helpers.robots import arm, chain
 from helpers.simulators import needs_pybullet
-from morphgen.checks import hold as module
-from morphgen.checks.hold import hold_files
+from morphgen.checks import conformance as module
+from morphgen.checks.conformance import hold_files
 from morphgen.checks.robot_srdf import collision_matrix, robot_srdf_text
 from morphgen.checks.self_collision import (
     ALWAYS_SHARE,
