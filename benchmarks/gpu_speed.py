@@ -1,6 +1,6 @@
 """Speed of physics and training on a GPU, beside MuJoCo Warp alone in the same run.
 
-    python benchmarks/gpu_speed.py physics [--splits A B] [--envs 1024 4096] [--geometry convex]
+    python benchmarks/gpu_speed.py physics [--splits A B] [--envs 1024 4096]
     python benchmarks/gpu_speed.py training [--agents me-tf] [--epochs 2] [--envs 16384]
     python benchmarks/gpu_speed.py robots [--grammar serial] [--numbers 10 300] [--envs 16384]
     python benchmarks/gpu_speed.py copies [--split SPLIT] [--envs 1024]
@@ -37,7 +37,6 @@ from morphgen.rl.ppo import Learner
 from morphgen.splits.split_file import read_split
 from morphgen.tasks.batch import StepGraph, TaskBatch
 from morphgen.tasks.observation import observation_config
-from morphgen.tasks.registry import COLLISION_GEOMETRIES, CollisionGeometry
 from morphgen.tasks.scenes.make import make_batch, make_split_batch
 from morphgen.tasks.sim.base import SUBSTEPS
 from morphgen.tasks.sim.warp_kernels import Joints
@@ -67,7 +66,6 @@ def main() -> int:
     parser.add_argument("--grammar", default="serial")
     parser.add_argument("--numbers", type=int, nargs="+", default=(10, 300))
     parser.add_argument("--envs", type=int, nargs="+", default=None)
-    parser.add_argument("--geometry", choices=COLLISION_GEOMETRIES, default="primitive")
     parser.add_argument("--agents", nargs="+", default=AGENTS)
     parser.add_argument("--epochs", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=5)
@@ -87,7 +85,7 @@ def _rows(args: argparse.Namespace) -> Iterator[Row]:
     if args.what == "physics":
         for split in args.splits:
             for envs in args.envs or ENVS:
-                yield _physics(split, envs, args.geometry, args.device)
+                yield _physics(split, envs, args.device)
     elif args.what == "training":
         for agent in args.agents:
             for envs in args.envs or (16384,):
@@ -133,13 +131,11 @@ class RawSimulation(WarpSimulation):
     group_type = RawGroup
 
 
-def _physics(split: str, envs: int, geometry: CollisionGeometry, device: str) -> Row:
+def _physics(split: str, envs: int, device: str) -> Row:
     """Return control steps per second of a batch, of its simulation, and of the library."""
     torch.cuda.reset_peak_memory_stats()
     began = time.perf_counter()
-    batch = make_split_batch(
-        read_split(split), "train", envs, sim="warp", device=device, geometry=geometry
-    )
+    batch = make_split_batch(read_split(split), "train", envs, sim="warp", device=device)
     simulation = batch.simulation
     assert isinstance(simulation, WarpSimulation)
     start_up = time.perf_counter() - began
@@ -159,7 +155,6 @@ def _physics(split: str, envs: int, geometry: CollisionGeometry, device: str) ->
     batch.reset(seed=0)
     row: Row = {
         "split": split,
-        "geometry": geometry,
         "environments": envs,
         "structures": len(simulation.counts),
     }

@@ -11,7 +11,7 @@ from contextlib import suppress
 from functools import cached_property
 from importlib import import_module
 from inspect import signature
-from typing import TYPE_CHECKING, Any, Generic, Literal, Protocol, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from morphgen.errors import MissingDependencyError, TaskError, nearest
 
@@ -21,10 +21,6 @@ if TYPE_CHECKING:
 
 KINEMATIC_CHANNELS = ("lag", "joint", "poses", "jacobian", "dls", "ik", "clearance", "contact")
 """Channels of ``kinematic_channels``, in the order in which networks concatenate them."""
-CollisionGeometry = Literal["primitive", "convex"]
-"""Collision shapes of simulated robots. ``primitive``: all primitives. ``convex``: convex pieces of
-the meshes, which are closer to them and take more time."""
-COLLISION_GEOMETRIES: tuple[CollisionGeometry, ...] = get_args(CollisionGeometry)
 CHANNELS = (
     *KINEMATIC_CHANNELS,
     *("velocity", "previous_action", "tree", "points", "no_state", "pace"),

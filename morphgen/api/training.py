@@ -45,7 +45,6 @@ from morphgen.tasks.registry import (
     DEFAULT_SIMULATOR,
     SIMULATORS,
     TASKS,
-    CollisionGeometry,
     batch_device,
     require_simulator_device,
 )
@@ -108,7 +107,6 @@ def train(
     train_goals: int | None = None,
     whole: bool = False,
     max_links: int | None = None,
-    geometry: CollisionGeometry = "primitive",
     bf16: bool = False,
     compile: bool = False,
     library: LibraryFolders = (),
@@ -160,7 +158,6 @@ def train(
         train_goals: Number of goals or starts per robot; by default 100, as in evaluations.
         whole: Whether ``se`` trains each robot of a split with all steps and environments.
         max_links: Number of links that observations have room for; by default at least 23.
-        geometry: Collision shapes in training: ``primitive``, or ``convex`` pieces of meshes.
         bf16: Whether to run the networks in bfloat16.
         compile: Whether to run networks and losses with ``torch.compile``.
         library: Folders of your own parts.
@@ -175,7 +172,7 @@ def train(
         MorphgenError: If a split or a robot cannot be read, or a robot cannot do the task.
     """
     given = SimpleNamespace(**locals())
-    texts = ("agent", "preset", "sim", "device", "drawn", "goal", "geometry")
+    texts = ("agent", "preset", "sim", "device", "drawn", "goal")
     least = {"minutes": 1, "robot_seed": 0, "slice_updates": 1, "train_goals": 2, "max_links": 2}
     least |= {"steps": 1, "envs": 1, "workers": 1, "seed": 0, "goal_seed": 0}
     require_types(given, TaskError, *texts, **least)
@@ -324,7 +321,6 @@ def run_config(source: robot_source.Source, spec: AgentSpec, given: SimpleNamesp
         ppo,
         seed=given.seed,
         sim=given.sim or DEFAULT_SIMULATOR,
-        geometry=given.geometry,
         num_envs=given.envs or preset.num_envs,
         device=given.device,
         full_budget=given.whole and AGENTS[spec.agent].per_robot,

@@ -21,7 +21,7 @@ from morphgen.errors import MorphgenError, nearest
 from morphgen.rl.agents import AGENTS, PRESETS
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.shipped_policies import POLICIES
-from morphgen.tasks.registry import CHANNELS, COLLISION_GEOMETRIES, SIMULATORS, TASKS
+from morphgen.tasks.registry import CHANNELS, SIMULATORS, TASKS
 
 COMMANDS = Path(__file__).with_name("commands.txt")
 """Definition of all commands; its head explains the notation."""
@@ -230,7 +230,6 @@ def _names() -> dict[str, Any]:
         "CHANNELS": ", ".join(CHANNELS).replace("_", "-") + "".join(observed),
         "PRESETS": tuple(PRESETS),
         "A_PRESET": "; ".join(f"{name}: {preset.summary}" for name, preset in PRESETS.items()),
-        "GEOMETRIES": COLLISION_GEOMETRIES,
     }
 
 

@@ -39,9 +39,8 @@ from morphgen.rl.runs.robot_source import (
 )
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.observation import ObservationConfig, observation_config
-from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS, CollisionGeometry
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig, config_fields, default_configs
-from morphgen.tasks.scenes.make import require_geometry
 from morphgen.tasks.task import TaskConfig
 
 
@@ -306,8 +305,6 @@ class RunConfig:
     ppo: PPOConfig  # hyperparameters of PPO
     seed: int = 0  # seed of weights, actions, minibatches and episodes
     sim: str = DEFAULT_SIMULATOR  # name of the simulator
-    geometry: CollisionGeometry = "primitive"
-    """Collision shapes of the robots in training; evaluations have all of them."""
     num_envs: int = 128  # number of parallel environments of all robots together
     device: str = "cpu"  # device of networks and rollouts
     initial_checkpoint: str = ""
@@ -336,7 +333,6 @@ class RunConfig:
             raise TaskError(f"--envs {self.num_envs}: expected 1 or more")
         if self.sim not in SIMULATORS:
             raise TaskError(f"unknown simulator {self.sim!r}{nearest(self.sim, SIMULATORS)}")
-        require_geometry(self.geometry)
         if self.max_links < 2:
             raise TaskError(f"--max-links {self.max_links}: expected 2 or more")
         if self.slice_updates < 0:
@@ -451,6 +447,8 @@ def config_from(data: object) -> RunConfig:
     """Return the run config of a JSON file or a checkpoint."""
     data = read_record(data, dict[str, Any], "run", TaskError)
     entries = {k: v for k, v in data.items() if k not in ("format", "morphgen")}
+    if (geometry := entries.pop("geometry", "primitive")) != "primitive":  # runs of 0.3 have it
+        raise TaskError(f"run: geometry {geometry!r}: robots collide as primitives now")
     tasks = {name: entries.pop(name) for name in list(entries) if name in TASKS}
     if "tasks" in entries:  # a field, but in files each task has an entry of its own
         raise TaskError("run: unknown key 'tasks'")

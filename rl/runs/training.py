@@ -234,7 +234,6 @@ class TrainingBatches:
             workers=self._workers,
             max_links=config.max_links,
             device=self._device,
-            geometry=config.geometry,
             library=map(Path, config.source.library),
         )
         return self._batch

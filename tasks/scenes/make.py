@@ -1,12 +1,11 @@
 """Batches of environments from robots, a split or specifications, in one call.
 
-The simulated robots collide as their primitives, one primitive for each link, or convex pieces.
+The simulated robots collide as their primitives.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict, TypeVar, get_args
@@ -16,14 +15,8 @@ import torch
 from morphgen.arguments import whole_number
 from morphgen.encoding.tokens import default_max_links
 from morphgen.errors import TaskError, nearest
-from morphgen.extras import explain_missing_extras
-from morphgen.fitting.replace_collision import as_convex
-from morphgen.formats.rounding import as_written
-from morphgen.grammar.compose import compose
-from morphgen.grammar.derivation import parse_derivation
-from morphgen.grammar.library import Library, LibraryFolders, default_library, library_folders
+from morphgen.grammar.library import LibraryFolders, default_library, library_folders
 from morphgen.grammar.robot_source import RobotLike, is_one_robot, robot_list
-from morphgen.model.robot import Robot
 from morphgen.progress import own_progress, show_progress
 from morphgen.splits.split import Side, Split
 from morphgen.tasks.actions import ActionKind
@@ -32,61 +25,19 @@ from morphgen.tasks.goals.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.random_numbers import require_seed
 from morphgen.tasks.registry import (
-    COLLISION_GEOMETRIES,
     DEFAULT_SIMULATOR,
     SIMULATORS,
-    CollisionGeometry,
     installed_simulators,
     require_simulator_device,
 )
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot, member_spec
 from morphgen.tasks.scenes.obstacles import LayoutSide
 from morphgen.tasks.scenes.robot_tables import build_robot_tables
-from morphgen.tasks.sim.base import Contacts, Scene, Simulator
+from morphgen.tasks.sim.base import Contacts, Simulator
 from morphgen.tasks.task import EnvSpec, TaskConfig
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
-
-
-def require_geometry(geometry: str) -> None:
-    """Require the name of a collision geometry."""
-    if geometry not in COLLISION_GEOMETRIES:
-        raise TaskError(
-            f"unknown collision geometry {geometry!r}{nearest(geometry, COLLISION_GEOMETRIES)}"
-        )
-
-
-@explain_missing_extras()
-def with_geometry(
-    scenes: Sequence[Scene], geometry: CollisionGeometry, folders: Sequence[Path] = ()
-) -> list[Scene]:
-    """Return scenes whose robots have the collision shapes of a geometry.
-
-    Masses and joints stay. Pairs of links that overlap with the new shapes wherever the
-    joints are, or at the home pose, do not collide.
-    """
-    if geometry == "primitive":
-        return list(scenes)
-    robots: dict[int, Robot] = {}
-    for scene in scenes:
-        if id(scene.robot) not in robots:
-            robots[id(scene.robot)] = _convex(scene.robot, folders)
-    return [replace(scene, robot=robots[id(scene.robot)]) for scene in scenes]
-
-
-def _convex(robot: Robot, folders: Sequence[Path]) -> Robot:
-    """Return the robot with the convex pieces of the meshes that its primitives were fitted to."""
-    if not robot.fits:  # it never had meshes
-        return robot
-    text = robot.provenance.get("derivation")
-    composed = compose(parse_derivation(str(text)), Library(folders), robot.name) if text else None
-    if composed is None or as_written(composed).joints != robot.joints:
-        raise TaskError(
-            f"robot {robot.name!r}: collision geometry 'convex' needs its meshes, which only a "
-            "robot that morphgen composes finds again; expected 'primitive'"
-        )
-    return as_written(as_convex(composed, folders))
 
 
 T = TypeVar("T")
@@ -105,7 +56,6 @@ class BatchOptions(TypedDict, total=False):
     first: int
     layouts: LayoutSide
     device: str
-    geometry: CollisionGeometry
 
 
 def make_batch(
@@ -224,13 +174,9 @@ def batch_from_specs(
     first: int = 0,
     layouts: LayoutSide = "train",
     device: str = "cpu",
-    geometry: CollisionGeometry = "primitive",
     library: LibraryFolders = (),
 ) -> TaskBatch:
-    """Make a batch of environments from their specifications.
-
-    Observations and goals do not depend on the collision geometry of the simulated robots.
-    """
+    """Make a batch of environments from their specifications."""
     if observe is not None and not isinstance(observe, ObservationConfig):
         raise TaskError(f"observe {observe!r}: expected an ObservationConfig")
     simulator = SIMULATORS[sim or DEFAULT_SIMULATOR]
@@ -248,22 +194,20 @@ def batch_from_specs(
     require_seed(seed)
     if kind not in (kinds := get_args(ActionKind)):
         raise TaskError(f"unknown action kind {kind!r}{nearest(kind, kinds)}")
-    require_geometry(geometry)
     require_simulator_device(simulator.name, device)
     if workers > 1 and not simulator.takes_workers:
         raise TaskError(
             f"simulator {simulator.name!r} steps all environments at once: {workers} workers; "
             "expected 1"
         )
-    _require_contacts(simulator, specs, geometry)
+    _require_contacts(simulator, specs)
     folders = default_library(library).folders
     robots = [spec.robot for spec in specs]
     if max_links is None:
         max_links = default_max_links(len(robot.links) for robot in robots)
     tables = build_robot_tables(robots, folders, max_links=max_links, device=device)
     env_robot_index = [(first + i) % len(specs) for i in range(num_envs)]
-    simulated = with_geometry([spec.scene for spec in specs], geometry, folders)
-    scenes = [simulated[i] for i in env_robot_index]
+    scenes = [specs[i].scene for i in env_robot_index]
     simulation = simulator.load(scenes, contacts, workers, torch.device(device))
     return TaskBatch(
         tables,
@@ -278,16 +222,10 @@ def batch_from_specs(
     )
 
 
-def _require_contacts(
-    simulator: Simulator, specs: Sequence[EnvSpec], geometry: CollisionGeometry
-) -> None:
+def _require_contacts(simulator: Simulator, specs: Sequence[EnvSpec]) -> None:
     """Require a simulator with contacts if a scene has something to touch."""
     if simulator.simulates_contacts:
         return
-    if geometry != "primitive":
-        raise TaskError(
-            f"collision geometry {geometry!r}: simulator {simulator.name!r} has no contacts"
-        )
     for spec in specs:
         if spec.scene.object is not None or spec.scene.obstacles:
             thing = "an object" if spec.scene.object is not None else "obstacles"

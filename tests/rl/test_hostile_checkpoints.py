@@ -115,6 +115,7 @@ CASES = [
     ("run/sim", "gazebo", "unknown simulator 'gazebo'; valid: kinematic, mujoco, pybullet"),
     ("run/ppo/colour", 1, "ppo: unknown key 'colour'"),
     ("run/source", GONE, "run: missing key 'source'"),
+    ("run/geometry", "convex", "geometry 'convex': robots collide as primitives now"),
     ("run", GONE, "is not a checkpoint of morphgen train"),
 ]
 

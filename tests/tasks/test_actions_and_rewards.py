@@ -32,7 +32,6 @@ from morphgen.grammar.library import default_library
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.kinematics_torch import matrix_from_quaternion
 from morphgen.model.robot import Frame, Link, Robot
-from morphgen.model.tree import rename
 from morphgen.rl.config import PPOConfig
 from morphgen.rl.runs.checkpoint import config_from
 from morphgen.tasks.actions import ActionDecoder, JointMotion
@@ -46,9 +45,9 @@ from morphgen.tasks.reach.task import Reach
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.rows import limit_violation, numpy_row, positive_part
 from morphgen.tasks.scenes.env_specs import load_robot
-from morphgen.tasks.scenes.make import make_batch, make_split_batch, with_geometry
+from morphgen.tasks.scenes.make import make_batch, make_split_batch
 from morphgen.tasks.scenes.robot_tables import STEP_SLIDE, STEP_TURN, build_robot_tables
-from morphgen.tasks.sim.base import CONTROL_PERIOD, Scene
+from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.tasks.speed import measure_speed
 from morphgen.tasks.task import GOAL, ObservationField, Task, TaskEnvs, TaskState
 
@@ -552,39 +551,6 @@ def test_folder_that_is_not_a_bundle_does_not_hide_a_grammar(tmp_path, monkeypat
 def test_unknown_name_suggests_the_nearest(given, error, says):
     with pytest.raises(error, match=re.escape(says)):
         load_robot(given)
-
-
-PANDA = "arm=panda ee=panda_hand"
-
-
-def test_unknown_and_unused_geometries_are_refused():
-    with pytest.raises(TaskError, match="geometry 'hull'; valid: convex, primitive"):
-        make_batch("reach", ["arm3"], 1, sim="mujoco", geometry="hull")
-    with pytest.raises(TaskError, match="'convex': simulator 'kinematic' has no contacts"):
-        make_batch("reach", ["arm3"], 1, sim="kinematic", geometry="convex")
-
-
-def test_convex_robots_collide_as_their_meshes():
-    simple, convex = (
-        make_batch("push", [PANDA], 2, sim="mujoco", geometry=geometry, seed=4)
-        for geometry in ("primitive", "convex")
-    )
-    first, other = simple.reset(), convex.reset()
-    assert all(torch.equal(first[name], other[name]) for name in first)
-    simulated, body = convex.simulation.scenes[0].robot, simple.specs[0].robot
-    assert convex.specs[0].robot.links == body.links != simulated.links
-    meshed = [link for link in simulated.links if has_meshes(link.collisions)]
-    assert len(meshed) == 9  # the Panda's meshes are convex, so each is its own piece
-    assert simulated.joints == body.joints
-
-
-def test_convex_pieces_need_the_meshes():
-    stranger, simple = replace(robot(PANDA), provenance={}), robot("prims")
-    renamed = rename(robot(PANDA), joints={robot(PANDA).joints[0].name: "renamed"})
-    for body in (stranger, renamed):
-        with pytest.raises(TaskError, match="'convex' needs its meshes"):
-            with_geometry([Scene(body)], "convex", default_library().folders)
-    assert with_geometry([Scene(simple)], "convex")[0].robot is simple
 
 
 CONFIG_SPEED = replace(ReachConfig(), num_goals=4, max_episode_steps=10)
