@@ -9,7 +9,7 @@ A row is one update: a rollout of 128 control steps in every environment, and fo
 minibatches. Within a simulator and number of threads all rows share:
 
 - the environments: reach of one robot, a new batch with the same padding and the same staggered
-  episodes; stable-baselines3 gets it through ``morphgen.tasks.gym.sb3.sb3_vector``. Continuous
+  episodes; stable-baselines3 gets it through ``morphgen.tasks.gym.sb3.SB3Vector``. Continuous
   actions.
 - rollout length, environments, epochs, minibatches and minibatch size, and thus gradient steps;
   clip range, discount, GAE lambda, entropy weight, Adam; separate value and policy networks.

@@ -3,65 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from os import PathLike
-from typing import TYPE_CHECKING, Any, TypedDict, overload
+from typing import TYPE_CHECKING, Any, overload
 
 from morphgen.arguments import text_argument
-from morphgen.errors import TaskError, nearest
+from morphgen.errors import TaskError
 from morphgen.extras import explain_missing_extras
-from morphgen.grammar.library import LibraryFolders
 from morphgen.grammar.robot_source import is_one_robot, robot_list
 
 if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
     from morphgen.grammar.robot_source import RobotLike
-    from morphgen.tasks.actions import ActionKind
     from morphgen.tasks.gym.env import TaskEnv
     from morphgen.tasks.gym.vector import TaskVector
-    from morphgen.tasks.observation import ObservationConfig
-    from morphgen.tasks.scenes.obstacles import LayoutSide
-    from morphgen.tasks.sim.base import Contacts
-    from morphgen.tasks.task import TaskConfig
-
-
-class SharedOptions(TypedDict, total=False):
-    """Keyword arguments of one environment and of vector environments."""
-
-    sim: str | None
-    kind: ActionKind
-    observe: ObservationConfig | None
-    contacts: Contacts | None
-    layouts: LayoutSide
-    goal_seed: int
-    cache: str | PathLike[str] | None
-    library: LibraryFolders
-    max_links: int | None
-    render_mode: str | None
-    size: tuple[int, int]
-
-
-class EnvOptions(SharedOptions, total=False):
-    """Keyword arguments of one environment; ``TaskEnv`` explains them."""
-
-    obstacles: bool
-    config: TaskConfig | None
-
-
-class VectorOptions(SharedOptions, total=False):
-    """Keyword arguments of vector environments; ``make_batch`` and ``TaskVector`` explain them."""
-
-    obstacles: bool | Sequence[bool]
-    configs: Sequence[TaskConfig]
-    seed: int | None
-    autoreset_mode: str
-    workers: int | None
-    device: str
 
 
 @overload
 def make_env(
-    task: str, robot: RobotLike = ..., *, num_envs: None = None, **options: Unpack[EnvOptions]
+    task: str, robot: RobotLike = ..., *, num_envs: None = None, **options: object
 ) -> TaskEnv: ...
 @overload
 def make_env(
@@ -69,7 +26,7 @@ def make_env(
     robot: RobotLike | Sequence[RobotLike] = ...,
     *,
     num_envs: int,
-    **options: Unpack[VectorOptions],
+    **options: object,
 ) -> TaskVector: ...
 @explain_missing_extras()
 def make_env(
@@ -111,11 +68,6 @@ def make_env(
         MissingDependencyError: If the extra ``tasks`` or the simulator is not installed.
         MorphgenError: If a robot cannot be composed or read, or cannot do the task.
     """
-    valid = (EnvOptions if num_envs is None else VectorOptions).__optional_keys__
-    for name in options:
-        if name not in valid:
-            kind = "one environment" if num_envs is None else "vector environments"
-            raise TaskError(f"{kind}: unknown option {name!r}{nearest(name, valid)}")
     texts: dict[str, object] = {"task": task, **options}
     for name in ("task", "sim", "kind"):
         if name in texts and (name, texts[name]) != ("sim", None):

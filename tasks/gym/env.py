@@ -8,9 +8,7 @@ precision: all of its formulas are those of the batch, for arrays of NumPy.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from inspect import currentframe
-from os import PathLike
 from typing import Any, cast
 
 import gymnasium as gym
@@ -19,30 +17,29 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
-from morphgen.grammar.library import LibraryFolders
 from morphgen.grammar.robot_source import RobotLike
 from morphgen.model.kinematics import FramePosition
-from morphgen.tasks.actions import ActionDecoder, ActionKind, JointMotion
+from morphgen.tasks.actions import ActionDecoder, JointMotion
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.gym.vector import (
     LINK_ENTRIES,
+    OPTIONS,
     Array,
     BatchEnv,
     NumpyObservation,
     action_space,
-    from_mapping,
+    batch_options,
     numpy_observation,
     observation_space,
     render_arguments,
     require_limit,
-    task_config,
 )
-from morphgen.tasks.observation import LinkJoints, LinkTokens, Observation, ObservationConfig
+from morphgen.tasks.observation import LinkJoints, LinkTokens, Observation
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.render.renderer import SIZE, Frame
 from morphgen.tasks.rows import numpy_row
+from morphgen.tasks.scenes.env_specs import GoalConfig
 from morphgen.tasks.scenes.make import make_batch
-from morphgen.tasks.scenes.obstacles import LayoutSide
 from morphgen.tasks.sim.base import Contacts
 from morphgen.tasks.task import STANDARD_FIELDS, StepFormulas, StepResult, TaskConfig, TaskEnvs
 
@@ -164,6 +161,9 @@ def _info(result: StepResult[Any], diverged: bool) -> dict[str, Any]:
     return info
 
 
+_OPTIONS = OPTIONS - {"workers", "device", "seed", "first", "configs"}
+
+
 class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
     """A robot at a task, such as ``gymnasium.make("morphgen/Reach-v0")`` makes.
 
@@ -198,61 +198,29 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         task: str,
         robot: RobotLike = "ur5-plane",
         *,
-        sim: str | None = None,
-        obstacles: bool = False,
-        layouts: LayoutSide = "train",
-        kind: ActionKind = "continuous",
-        observe: ObservationConfig | Mapping[str, Any] | None = None,
-        contacts: Contacts | Mapping[str, Any] | None = None,
         config: TaskConfig | Mapping[str, Any] | None = None,
-        goal_seed: int = 0,
-        cache: str | PathLike[str] | None = None,
-        library: LibraryFolders = (),
-        max_links: int | None = None,
         render_mode: str | None = None,
         size: tuple[int, int] = SIZE,
+        **options: Any,  # noqa: ANN401
     ) -> None:
         """Load the robot, sample its goal set if it is not cached, and load the simulation.
 
         The arguments are those of ``make_batch``; pictures have a width and a height [pixels].
         """
         render_arguments(render_mode, size)
-        sim = sim or DEFAULT_SIMULATOR
-        task_kind = TASKS[task]
-        observe = from_mapping("observe", ObservationConfig, observe)
-        contacts = from_mapping("contacts", Contacts, contacts)
-        self._self_collision = (contacts or Contacts()).self_collision
-        self._self_collision &= SIMULATORS[sim].simulates_contacts
-        config_type = task_kind.config_type
-        config = from_mapping("config", partial(task_config, task), config) or config_type()
-        if not isinstance(config, config_type):
-            raise TaskError(
-                f"{type(config).__name__} is not the config of {task}: expected "
-                f"{config_type.__name__}"
-            )
-        require_limit(_limit_for_make(), config.max_episode_steps)
+        options = batch_options("one environment", task, config, options, _OPTIONS)
+        sim = SIMULATORS[options.get("sim") or DEFAULT_SIMULATOR]
+        contacts: Contacts = options["contacts"] or Contacts()
+        self._self_collision = contacts.self_collision and sim.simulates_contacts
+        limit = GoalConfig(tasks=options.get("configs", ())).task_config(task).max_episode_steps
+        require_limit(_limit_for_make(), limit)
         self.task = task
-        batch = make_batch(
-            task,
-            [robot],
-            1,
-            obstacles=obstacles,
-            layouts=layouts,
-            goal_seed=goal_seed,
-            configs=(config,),
-            cache=cache,
-            library=library,
-            sim=sim,
-            kind=kind,
-            observe=observe,
-            contacts=contacts,
-            max_links=max_links,
-        )
+        batch = make_batch(task, [robot], 1, **options)
         self._wrap(batch, render_mode, size)
         self.env_spec = batch.specs[0]
         robot_links = self.env_spec.robot.joints
-        other_fields = set(STANDARD_FIELDS) - set(task_kind.fields)
-        self._hidden = {field.name for field in other_fields}
+        fields = TASKS[task].fields
+        self._hidden = {field.name for field in {*STANDARD_FIELDS} - {*fields}}
         self.action_links: tuple[int, ...] = tuple(
             torch.nonzero(self.batch.action_mask[0])[:, 0].tolist()
         )
@@ -263,9 +231,9 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         first = self._without_padding(self.batch.observe())
         self.observation_space = cast(
             "gym.Space[NumpyObservation]",
-            observation_space({k: v[None] for k, v in first.items()}, task_kind.fields),
+            observation_space({k: v[None] for k, v in first.items()}, fields),
         )
-        self.action_space = action_space(kind, len(self.action_links))
+        self.action_space = action_space(batch.action_kind, len(self.action_links))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -11,7 +11,6 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from morphgen.errors import MissingDependencyError, TaskError
-from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.gym.vector import NumpyObservation, TaskVector
 
 try:
@@ -24,11 +23,6 @@ except ModuleNotFoundError as error:
     ) from error
 
 Indices = int | Iterable[int] | None
-
-
-def sb3_vector(batch: TaskBatch) -> SB3Vector:
-    """Return the batch as a ``VecEnv``, for example for stable-baselines3's ``PPO``."""
-    return SB3Vector(TaskVector(batch))
 
 
 class SB3Vector(VecEnv):
@@ -51,7 +45,7 @@ class SB3Vector(VecEnv):
 
     def reset(self) -> dict[str, NDArray[Any]]:
         """Begin an episode in every environment, with the seed if one was set."""
-        observation, _ = self.vector.reset(seed=self._seeds[0])
+        observation, _ = self.vector.reset(seed=self._seeds[0], options=self._options[0])
         self._reset_seeds()
         self._reset_options()
         return observation

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from inspect import signature
 from typing import Any, TypeVar
 
@@ -23,7 +22,7 @@ from morphgen.grammar.robot_source import RobotLike
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.observation import Observation, ObservationConfig
-from morphgen.tasks.registry import KINEMATIC_CHANNELS, register_gym_envs
+from morphgen.tasks.registry import KINEMATIC_CHANNELS, TASKS, register_gym_envs
 from morphgen.tasks.render.renderer import SIZE, Frame, Renderer, RenderState, render_state
 from morphgen.tasks.scenes.env_specs import task_configs
 from morphgen.tasks.scenes.make import BatchOptions, make_batch
@@ -115,9 +114,40 @@ def from_mapping(
         raise TaskError(f"{name} {dict(value)}: {error}") from error
 
 
-def task_config(task: str, **constants: Any) -> TaskConfig:  # noqa: ANN401 - of the task's types
-    """Return the config of a task from its constants as JSON data."""
-    return task_configs({task: constants})[0]
+OPTIONS = frozenset(
+    {*signature(make_batch).parameters, *BatchOptions.__optional_keys__}
+    - {"task", "robots", "num_envs", "options"}
+)
+"""Keyword arguments of ``make_batch`` that vector environments take."""
+
+
+def batch_options(
+    what: str,
+    task: str,
+    config: TaskConfig | Mapping[str, Any] | None,
+    options: Mapping[str, Any],
+    valid: frozenset[str],
+) -> dict[str, Any]:
+    """Return keyword arguments of ``make_batch`` from options that may be dictionaries, as in JSON.
+
+    They include the task's constants, ``config``.
+    """
+    for name in options:
+        if name not in valid:
+            hint = nearest(name, valid | {"config", "render_mode", "robot", "size"})
+            raise TaskError(f"{what}: unknown option {name!r}{hint}")
+    given = dict(options)
+    for name, make in (("observe", ObservationConfig), ("contacts", Contacts)):
+        given[name] = from_mapping(name, make, given.get(name))
+    kind = TASKS[task].config_type
+    if config is not None:
+        config = from_mapping("config", lambda **values: task_configs({task: values})[0], config)
+        if not isinstance(config, kind):
+            raise TaskError(
+                f"{type(config).__name__} is not the config of {task}: expected {kind.__name__}"
+            )
+        given["configs"] = (config,)
+    return given
 
 
 class BatchEnv:
@@ -361,16 +391,7 @@ def task_vector(
     **options: Any,  # noqa: ANN401
 ) -> TaskVector:
     """Make a vector environment for ``gymnasium.make_vec("morphgen/Reach-v0", num_envs, ...)``."""
-    valid = {*signature(make_batch).parameters, *BatchOptions.__optional_keys__}
-    valid -= {"task", "num_envs", "options"}
-    for name in options:
-        if name not in valid:
-            raise TaskError(f"vector environments: unknown option {name!r}{nearest(name, valid)}")
-    for name, kind in (("observe", ObservationConfig), ("contacts", Contacts)):
-        if name in options:
-            options[name] = from_mapping(name, kind, options[name])
-    if config is not None:
-        options["configs"] = (from_mapping("config", partial(task_config, task), config),)
+    options = batch_options("vector environments", task, config, options, OPTIONS)
     if options.get("seed") is None:
         options["seed"] = int(np.random.default_rng().integers(2**63))
     autoreset_mode = _autoreset_mode(autoreset_mode)

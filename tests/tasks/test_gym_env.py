@@ -29,7 +29,7 @@ from morphgen.progress import show_progress
 from morphgen.tasks import make_batch
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.gym.env import TaskEnv
-from morphgen.tasks.gym.sb3 import SB3Vector, sb3_vector
+from morphgen.tasks.gym.sb3 import SB3Vector
 from morphgen.tasks.gym.vector import TaskVector, observation_space, task_vector
 from morphgen.tasks.observation import ObservationConfig, observation_config
 from morphgen.tasks.push.config import PushConfig
@@ -534,7 +534,7 @@ def test_returned_arrays_are_copies(mixed_batch):
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
 def test_stable_baselines3_ppo_learns(mixed_batch, kind):
-    envs = VecMonitor(sb3_vector(mixed_batch(kind=kind)))
+    envs = VecMonitor(SB3Vector(TaskVector(mixed_batch(kind=kind))))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         model = PPO("MultiInputPolicy", envs, n_steps=12, batch_size=48, n_epochs=1, seed=0)
@@ -550,7 +550,7 @@ def test_stable_baselines3_ppo_learns(mixed_batch, kind):
 
 
 def test_stable_baselines3_infos_distinguish_truncation(mixed_batch):
-    envs = sb3_vector(mixed_batch())
+    envs = SB3Vector(TaskVector(mixed_batch()))
     envs.seed(3)
     first = envs.reset()["goal"]
     assert np.array_equal(first, TaskVector(mixed_batch(seed=3)).reset()[0]["goal"])
@@ -567,7 +567,7 @@ def test_stable_baselines3_infos_distinguish_truncation(mixed_batch):
 
 
 def test_stable_baselines3_can_read_attributes(mixed_batch):
-    envs = sb3_vector(mixed_batch())
+    envs = SB3Vector(TaskVector(mixed_batch()))
     assert envs.get_attr("num_envs", [0, 2]) == [4, 4]
     assert envs.env_is_wrapped(gym.Wrapper) == [False] * 4
     envs.set_attr("label", "x")
