@@ -15,6 +15,7 @@ from filelock import FileLock, Timeout
 from morphgen.errors import FormatError, MorphgenError, shortened
 from morphgen.files import file_sha256, write_atomic
 from morphgen.formats.data_files import read_json
+from morphgen.formats.records import dotted_values
 
 SYSTEM_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
 """Files that file managers write into the folders that they show."""
@@ -138,29 +139,14 @@ def begin_folder(
     stored, wanted = read_json(path), json.loads(text)
     if not isinstance(stored, dict) or not stored.keys() >= wanted.keys():
         raise FormatError(f"{path}: expected the settings of a {kind}: {', '.join(wanted)}")
-    for key, value in wanted.items():
-        if stored[key] != value:
-            name, old, new = _first_difference(key, stored[key], value)
+    old, new = (dotted_values({key: data[key] for key in wanted}) for data in (stored, wanted))
+    for name in {**old, **new}:
+        was, is_now = (shortened(repr(each.get(name, "(none)"))) for each in (old, new))
+        if old.get(name, "(none)") != new.get(name, "(none)"):
             raise error_type(
-                f"{folder} holds another {kind}: its {name} is {shortened(repr(old))}, not "
-                f"{shortened(repr(new))}; name another folder"
+                f"{folder} holds another {kind}: its {name} is {was}, not {is_now}; name another "
+                "folder"
             )
-
-
-def _first_difference(name: str, old: object, new: object) -> tuple[str, object, object]:
-    """Return the name and the values of the first entries of two JSON values that differ."""
-    match old, new:
-        case dict(), dict():
-            names = [(f"{name}.{key}", key) for key in old if key in new and old[key] != new[key]]
-        case list(), list():
-            pairs = enumerate(zip(old, new, strict=False))
-            names = [(f"{name}[{i}]", i) for i, (a, b) in pairs if a != b]
-        case _:
-            return name, old, new
-    if not names:  # one has more entries
-        return name, old, new
-    path, key = names[0]
-    return _first_difference(path, old[key], new[key])
 
 
 @contextmanager

@@ -266,13 +266,13 @@ _COLLADA_LOST = {
     "convex_mesh": "convex meshes",
     "spline": "splines",
     "ph": "polygons with holes",
+    "instance_controller": "skins or morph targets",
 }
 
 
 def read_dae(data: bytes, files: FolderResolver) -> list[MeshPart]:
-    """Read a COLLADA file by trimesh, with skins as plain geometries and readable textures only."""
+    """Read a COLLADA file by trimesh, with readable textures only."""
     root = _collada(data)
-    _place_skins(root, files)
     for element in [*root]:
         if _tag(element) not in _COLLADA_PARTS:
             root.remove(element)
@@ -339,37 +339,6 @@ def _remove(root: etree._Element, tag: str) -> int:
         if (parent := element.getparent()) is not None:
             parent.remove(element)
     return len(elements)
-
-
-def _place_skins(root: etree._Element, files: FolderResolver) -> None:
-    """Replace every instance of a controller by one of the geometry that it deforms, at rest."""
-    controllers = {f"#{c.get('id')}": c for c in root.iter("{*}controller")}
-    for instance in [*root.iter("{*}instance_controller")]:
-        url = instance.get("url", "")
-        matrix = np.eye(4)
-        visited = set()
-        while url in controllers and url not in visited:
-            visited.add(url)
-            deformer = next(controllers[url].iterchildren("{*}skin", "{*}morph"), None)
-            if deformer is None:
-                break
-            bind = deformer.findtext("{*}bind_shape_matrix")
-            if bind and _tag(deformer) == "skin":
-                matrix = matrix @ parse_numbers(bind).reshape(4, 4)
-            kind = "a skin" if _tag(deformer) == "skin" else "morph targets"
-            files.left_out.append(f"{kind}, whose mesh is drawn at rest")
-            url = deformer.get("source", "")
-        namespace = etree.QName(instance).namespace
-        prefix = f"{{{namespace}}}" if namespace else ""
-        node = etree.Element(f"{prefix}node")
-        etree.SubElement(node, f"{prefix}matrix").text = " ".join(
-            map(repr, matrix.ravel().tolist())
-        )
-        geometry = etree.SubElement(node, f"{prefix}instance_geometry", url=url)
-        geometry.extend(instance.findall("{*}bind_material"))
-        parent = instance.getparent()
-        if parent is not None:
-            parent.replace(instance, node)
 
 
 def _check_textures(root: etree._Element, files: FolderResolver) -> None:

@@ -256,10 +256,6 @@ def dae_with(primitive):
 
 INPUT = '<input semantic="VERTEX" source="#v" offset="0"/>'
 TRIANGLES = f'<triangles count="4">{INPUT}<p>0 2 1 0 1 3 0 3 2 1 2 3</p></triangles>'
-SKIN = """<library_controllers><controller id="c"><skin source="#g">
-<bind_shape_matrix>1 0 0 5 0 1 0 0 0 0 1 0 0 0 0 1</bind_shape_matrix></skin></controller>
-<controller id="m"><morph source="#g"/></controller>
-<controller id="cm"><skin source="#m"/></controller></library_controllers><library_visual_scenes>"""
 
 
 @pytest.mark.parametrize(
@@ -291,28 +287,6 @@ def test_every_form_of_a_tetrahedron_is_read_whole(name, content, tmp_path):
     assert volume(mesh) == pytest.approx(1)
 
 
-@pytest.mark.parametrize(
-    ("instance", "notes"),
-    [
-        ("c", ("a skin, whose mesh is drawn at rest",)),
-        ("m", ("morph targets, whose mesh is drawn at rest",)),
-        ("cm", ("a skin, whose mesh is drawn at rest",
-                "morph targets, whose mesh is drawn at rest")),
-    ],
-)  # fmt: skip
-def test_a_skin_or_morph_of_a_collada_file_is_read_at_rest(instance, notes, tmp_path):
-    text = dae_of(
-        skin=("<library_visual_scenes>", SKIN),
-        node=("</visual_scene>", f'<node><instance_controller url="#{instance}"/></node>'
-              "</visual_scene>"),
-    )  # fmt: skip
-    mesh = read(tmp_path, "mesh_with_skin.dae", text)
-    assert count(mesh) == 8
-    assert mesh.left_out == notes
-    highest = max(part.vertices[:, 0].max() for part in mesh.parts)
-    assert highest == (6 if instance == "c" else 1)
-
-
 LINES = f'<lines count="1">{INPUT}<p>0 1</p></lines>'
 SOLID_OBJ = "v 0 0 0\nv 1 0 0\nv 0 2 0\nv 0 0 3\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 NOTED = {
@@ -321,6 +295,10 @@ NOTED = {
     "lost.dae": (
         dae_of(n=("</node>", '</node><node><instance_geometry url="b.dae#x"/></node>')),
         "1 instances of 'b.dae#x', which the file does not define",
+    ),
+    "skin.dae": (
+        dae_of(n=("</node>", '</node><node><instance_controller url="#c"/></node>')),
+        "1 skins or morph targets",
     ),
     "texture.dae": (
         dae_of(t=("<color>1 0 0 1</color>", '<texture texture="nosuch" texcoord="UV"/>')),
