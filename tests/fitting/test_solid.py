@@ -60,15 +60,6 @@ def angle():
     return trimesh.Trimesh(vertices, [*cap[:, ::-1], *(cap + 6), *walls])
 
 
-def half_tube(n=24):
-    """A strip bent around z by half a turn, with a radius of 0.2 and a width of 0.4."""
-    turns = np.linspace(0, math.pi, n)
-    vertices = [(0.2 * math.cos(a), 0.2 * math.sin(a), z) for a in turns for z in (-0.2, 0.2)]
-    firsts = [2 * i for i in range(n - 1)]
-    faces = [three for i in firsts for three in ((i, i + 2, i + 1), (i + 1, i + 2, i + 3))]
-    return trimesh.Trimesh(vertices, faces)
-
-
 def test_a_closed_box_is_its_own_solid():
     solid = solid_of_mesh(box())
     assert (solid.method, solid.decimated_from) == ("watertight", None)
@@ -168,19 +159,6 @@ def test_a_sphere_with_many_holes_is_solid_by_winding_number(inverted):
     assert not solid.mesh.is_watertight
     assert solid.contains(np.zeros((1, 3))).all()
     assert counted(solid) == pytest.approx(volume(Sphere(0.2)), rel=0.05)
-
-
-@pytest.mark.parametrize("turned", [False, True])
-def test_half_a_tube_is_solid_by_winding_number(turned):
-    mesh = half_tube()
-    if turned:
-        mesh.invert()
-    solid = solid_of_mesh(mesh)
-    assert solid.method == "winding"
-    inside = GRID[solid.contains(GRID)]
-    assert inside[:, 1].min() > 0
-    assert np.linalg.norm(inside[:, :2], axis=1).max() < 0.2
-    assert 0.3 < counted(solid) / (math.pi * 0.2**2 / 2 * 0.4) < 1
 
 
 def test_a_sheet_that_encloses_almost_nothing_becomes_its_convex_hull():

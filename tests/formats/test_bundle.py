@@ -7,7 +7,6 @@ import random
 import re
 import shutil
 import stat
-import sys
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -309,17 +308,6 @@ def test_the_same_content_under_another_name_has_the_same_key(mesh, tmp_path):
     assert shapes_key([Shape(copy, TILTED)]) == shapes_key([Shape(mesh, TILTED)])
 
 
-def test_a_key_follows_the_working_directory(tmp_path, monkeypatch):
-    keys = set()
-    for name, size in (("a", 1.0), ("b", 2.0)):
-        (tmp_path / name).mkdir()
-        trimesh.creation.box((size,) * 3).export(tmp_path / name / "m.stl")
-        os.utime(tmp_path / name / "m.stl", ns=(1, 1))
-        monkeypatch.chdir(tmp_path / name)
-        keys.add(shapes_key([Shape(Mesh(Path("m.stl")))]))
-    assert len(keys) == 2
-
-
 def test_changes_of_the_solid_change_the_key(mesh):
     geometries = [
         mesh,
@@ -441,13 +429,3 @@ def test_triton_is_imported_before_an_opengl_library(monkeypatch):
 def test_a_process_can_draw_and_then_import_triton():
     code = "from morphgen.formats.picture import gl_context; gl_context(8, 8).free(); import triton"
     assert run_python(code).stderr == ""
-
-
-def test_a_picture_does_not_depend_on_optional_packages(tmp_path, monkeypatch):
-    composed = morphgen.compose("arm3-stick")
-    mjcf = morphgen.write(composed, tmp_path, picture=False) / "robot.xml"
-    image = picture.render(composed, mjcf, size=(64, 48))
-    for package in ("pybullet", "trimesh", "viser"):
-        monkeypatch.setitem(sys.modules, package, None)
-    assert picture.render(composed, mjcf, size=(64, 48)).tobytes() == image.tobytes()
-    assert len(image.getcolors()) > 1
