@@ -208,8 +208,7 @@ def _require_startable(cell: studies.Cell, config: RunConfig, args: argparse.Nam
             require_runnable(studies.finetuning_run(cell, config, steps))
         except TaskError as error:
             raise TaskError(f"--finetune {steps}: {error}") from error
-    is_on_gpu = args.device != "cpu" and args.ray is None  # with Ray, other machines have the GPUs
-    if is_on_gpu and not all(map(is_done, parts)):
+    if args.device != "cpu" and not all(map(is_done, parts)):
         require_device(args.device)  # policies are evaluated on the CPU
 
 
@@ -240,11 +239,7 @@ def _run_cells(
     """Run the cells and return how many failed."""
     failures = 0
     with training_progress("if the same command is given again") as show:
-        if args.ray is None:
-            outcomes = studies.run_cells(cells, execution, show.training)
-        else:
-            gpus = args.gpus if args.gpus is not None else float(args.device != "cpu")
-            outcomes = studies.run_cells_on_ray(cells, execution, args.ray or None, gpus=gpus)
+        outcomes = studies.run_cells(cells, execution, show.training)
         for done, (cell, error) in enumerate(outcomes, 1):
             show.close()
             seed = "" if cell.seed is None else f" seed {cell.seed}"

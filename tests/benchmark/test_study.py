@@ -24,7 +24,6 @@ from morphgen.benchmark.scores.study import (
     matched_budget,
     require_cells,
     run_cells,
-    run_cells_on_ray,
     stored_results,
     write_tables,
 )
@@ -260,16 +259,3 @@ def test_matched_budget_gives_test_robots_as_much_data_as_train_robots():
     (alone, *_) = subruns_of(Path("se@test"), own)
     assert (alone.config.ppo, alone.config.num_envs) == (part.config.ppo, part.config.num_envs)
     assert matched_budget(replace(config, full_budget=True)) == replace(config, full_budget=True)
-
-
-@pytest.mark.slow
-def test_ray_gives_the_same_scores(whole, tmp_path):
-    pytest.importorskip("ray")
-    cells = cells_in(tmp_path, seeds=(0,))
-    for _ in range(2):
-        outcomes = list(run_cells_on_ray(cells, QUIET, None))
-        assert sorted(cell.agent for cell, _ in outcomes) == sorted(c.agent for c in cells)
-        assert not any(error for _, error in outcomes)
-    same = [cell for cell in whole if cell.seed != 1]
-    for one, other in zip(same, cells, strict=True):
-        assert stored_results(one) == stored_results(other)

@@ -158,7 +158,6 @@ SUBMIT a.json --sim pybullet => expected 'mujoco'
 eval zero --split prims task=reach --submission a.json => prims is no split
 finetune nothing => no checkpoint
 study nothing => nothing: no such file, and no split of this name
-STUDY --gpus 1 => --gpus: only with --ray
 STUDY --seeds 2..x => --seeds 2..x
 STUDY --agents se,se => is there twice
 STUDY --agents me-tf@test => only se
@@ -424,4 +423,4 @@ def accepts(convert, text):
 def test_numbers_are_checked_before_the_work():
     numbers = [each for each in actions_of(cli.build_parser()) if each.metavar == "N"]
     unchecked = {each.dest for each in numbers if each.type and accepts(each.type, "-1")}
-    assert (len(numbers) > 60, unchecked) == (True, {"gpus", "test"})
+    assert (len(numbers) > 60, unchecked) == (True, {"test"})

@@ -20,7 +20,6 @@ from morphgen.benchmark.scores import submission
 from morphgen.benchmark.scores.results import NOTE, result_rows, result_tables, rows_data
 from morphgen.errors import MorphgenError, TaskError
 from morphgen.formats.files import LOCK, write_file
-from morphgen.processes import ray_cluster, require_ray
 from morphgen.progress import stage
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.baselines import BASELINES
@@ -287,32 +286,6 @@ def run_cells(
         if skipped >= len(waiting):
             time.sleep(POLL)
             skipped = 0
-
-
-def run_cells_on_ray(
-    cells: Sequence[Cell], execution: ExecutionConfig, address: str | None, *, gpus: float = 0.0
-) -> Iterator[Outcome]:
-    """Train and evaluate cells on a Ray cluster that shares the folder; yield their outcomes."""
-    ray = require_ray()
-    with ray_cluster(address):
-        remote = ray.remote(num_cpus=execution.workers, num_gpus=gpus, max_retries=0)(_on_ray)
-        # Workers of a cluster have another current folder.
-        running = {
-            remote.remote(replace(cell, study=cell.study.resolve()), execution): cell
-            for cell in cells
-        }
-        while running:
-            (done, *_), _ = ray.wait(list(running))
-            cell = running.pop(done)
-            try:
-                yield cell, ray.get(done)
-            except ray.exceptions.RayError as error:
-                yield cell, f"its Ray task failed: {type(error).__name__}: {error}"
-
-
-def _on_ray(cell: Cell, execution: ExecutionConfig) -> str:
-    ((_, error),) = run_cells([cell], execution)
-    return error
 
 
 def _do_locked(
