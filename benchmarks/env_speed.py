@@ -59,12 +59,14 @@ import torch
 from tabulate import tabulate
 from tqdm import tqdm
 
+from morphgen.processes import one_torch_thread
 from morphgen.splits.split_file import read_split
+from morphgen.tasks.actions import BINS
+from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.make import make_batch, make_split_batch
 from morphgen.tasks.sim import bullet_scene
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts
-from morphgen.tasks.speed import measure_speed, random_actions
 
 Rate = Callable[[float], float]
 """Measure environment steps per second over at least the given number of seconds."""
@@ -319,6 +321,46 @@ def _panda(name: str, steps: int | None = None) -> Any:  # noqa: ANN401 - its en
     sim.n_substeps, sim.timestep = SUBSTEPS, TIMESTEP
     sim.physics_client.setTimeStep(TIMESTEP)
     return env
+
+
+def random_actions(batch: TaskBatch, count: int, seed: int) -> list[torch.Tensor]:
+    """Return uniformly random actions, shape (n, L) each."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = (count, *batch.action_mask.shape)
+    if batch.action_kind == "discrete":
+        drawn = torch.randint(len(BINS), shape, generator=generator)
+    else:
+        drawn = 2 * torch.rand(shape, generator=generator) - 1
+    return list(drawn.to(batch.device).unbind(0))
+
+
+@one_torch_thread()
+def measure_speed(
+    batch: TaskBatch,
+    seconds: float,
+    *,
+    clock: Callable[[], float] = time.perf_counter,
+) -> float:
+    """Return the control steps per second of all environments under random actions, with resets.
+
+    The measurement covers whole episodes: the cost of contacts depends on the time since they
+    began, and a faster simulator would otherwise get further into them. One seed gives
+    all simulators the same episodes, since some cost a tenth more than others.
+
+    seconds: Least duration [s]; an episode that began is finished.
+    """
+    episode = int(batch.max_episode_steps.max())
+    actions = random_actions(batch, episode, 0)
+    batch.reset()
+    for action in actions[:20]:
+        batch.step(action)
+    batch.reset(0)  # after the warm-up, for the same episodes in all simulators
+    steps = 0
+    start = clock()
+    while steps % episode or clock() - start < seconds:  # whole episodes
+        batch.step(actions[steps % episode])
+        steps += 1
+    return steps * batch.num_envs / (clock() - start)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
+from env_speed import random_actions
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.grammar.library import default_library
 from morphgen.splits.split import compose_side
@@ -27,7 +28,6 @@ from morphgen.splits.split_file import read_split
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.registry import SIMULATORS
 from morphgen.tasks.scenes.make import make_batch
-from morphgen.tasks.speed import random_actions
 
 GROWTH = 1.05
 """Largest accepted ratio of the memory at the end to the memory after a tenth of the time."""

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.errors import NoGoalsError, TaskError
+from morphgen.errors import MorphgenError, NoGoalsError, SimulationError, TaskError
 from morphgen.formats.mjcf.write import MujocoKinematics
+from morphgen.formats.resolve import default_finder
 from morphgen.formats.rounding import as_written
+from morphgen.formats.urdf.read import robot_from_xml
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar.compose import compose
 from morphgen.grammar.derivation import Derivation
@@ -22,7 +25,6 @@ from morphgen.model.geometry import Mesh, Pose
 from morphgen.model.kinematics import joint_limits, solve_position_ik
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.articulated.config import ArticulatedConfig
-from morphgen.tasks.articulated.object_file import read_body
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.starts import BEHIND, draw_starts, sample_tools_in_box, work_region
 from morphgen.tasks.scenes.obstacles import no_obstacles
@@ -99,6 +101,17 @@ class ArticulatedStartSet(GoalSet):
     def goal_poses(self) -> Array:
         """Poses of the object at its goals, shape (S, 7)."""
         return self.thing.placed_joint.poses(self.goal)
+
+
+def read_body(text: str) -> Robot:
+    """Return the object of a URDF's text, which may come from strangers: it has no files."""
+    if "<mesh" in text:
+        raise SimulationError("the object has meshes; expected primitives")
+    where = Path("object.urdf")
+    try:
+        return robot_from_xml(text.encode(), where, default_finder(), written_frames=True)
+    except MorphgenError as error:
+        raise SimulationError(f"the object: {error}") from error
 
 
 def object_manifest(config: ArticulatedConfig) -> Manifest:

@@ -3,7 +3,6 @@
 import math
 import re
 from dataclasses import dataclass, replace
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +47,6 @@ from morphgen.tasks.scenes.env_specs import load_robot
 from morphgen.tasks.scenes.make import make_batch, make_split_batch
 from morphgen.tasks.scenes.robot_tables import STEP_SLIDE, STEP_TURN, build_robot_tables
 from morphgen.tasks.sim.base import CONTROL_PERIOD
-from morphgen.tasks.speed import measure_speed
 from morphgen.tasks.task import GOAL, ObservationField, Task, TaskEnvs, TaskState
 
 CPU = torch.device("cpu")
@@ -551,14 +549,3 @@ def test_folder_that_is_not_a_bundle_does_not_hide_a_grammar(tmp_path, monkeypat
 def test_unknown_name_suggests_the_nearest(given, error, says):
     with pytest.raises(error, match=re.escape(says)):
         load_robot(given)
-
-
-CONFIG_SPEED = replace(ReachConfig(), num_goals=4, max_episode_steps=10)
-
-
-def test_the_speed_is_that_of_whole_episodes(made):
-    ticks, batch = count(), made(CONFIG_SPEED, ["arm3-claw"], 2)
-    # The clock is read at the start, before each episode of 10 steps, and at the end: 0 to 4.
-    speed = measure_speed(batch, 3, clock=lambda: float(next(ticks)))
-    assert batch.episode_step.tolist() == [0, 0]
-    assert speed == 2 * 20 / 4

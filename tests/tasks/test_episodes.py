@@ -88,9 +88,6 @@ class StubSimulation:
         self.diverges.zero_()
         return diverged
 
-    def faults(self):
-        return {}
-
     def close(self):
         pass
 
