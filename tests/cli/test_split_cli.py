@@ -109,6 +109,13 @@ def test_a_hold_out_split_passes_its_audit(ok):
     assert out.endswith("my/no-kinova: passed: 0 error, 0 warning, 0 accepted\n")
 
 
+def test_robots_that_were_left_out_are_counted_with_their_reason(ok):
+    pattern = "arm={lwr,panda,kinova_gen3,ur5,arm3} ee={plane,stick}"
+    options = ("--from", pattern, "--test", "2", "--max-links", "10", "--seed", "2")
+    line = "  robots that were left out: 2 with more than 10 links"
+    assert line in ok(*HOLD_OUT, *options).splitlines()
+
+
 def test_several_train_sizes_write_one_file_each(run, ok):
     out = ok(*INTERPOLATION[:-1], "1,2,4", "--name", "my/cubes", "--out", "splits")
     paths = [Path(f"splits/my/cubes-train{n}.yaml") for n in (1, 2, 4)]

@@ -30,7 +30,7 @@ from morphgen.viewer.robot_tables import is_about, joint_groups, link_card, link
 from morphgen.viewer.robot_uri import read_robot_uri
 from morphgen.viewer.scene import overlays as workspace
 from morphgen.viewer.scene.robot import RED
-from morphgen.viewer.scene.stage import add_scale_bar, inertia_box, look_at
+from morphgen.viewer.scene.stage import inertia_box, look_at
 
 ARM = "?robot=robots/some-arm"
 
@@ -360,7 +360,6 @@ def test_toggles_draw_grown_shapes_names_boxes_and_the_workspace(viewer):
         client.until(lambda: "/robot/workspace" not in view)
 
 
-POINT = np.zeros(3)
 LOW, HIGH = np.array([-1.0, -0.2, 0.0]), np.array([1.0, 0.2, 0.5])
 
 
@@ -405,13 +404,3 @@ def test_a_camera_that_the_user_has_moved_stays():
     before = camera.position.copy()
     camera.resize(0.9)
     np.testing.assert_array_equal(camera.position, before)
-
-
-def test_a_robot_without_shapes_has_a_scale_bar():
-    labels = []
-    scene = SimpleNamespace(
-        add_batched_meshes_simple=lambda *args, **options: None,
-        add_label=lambda name, text, position: labels.append(text),
-    )
-    add_scale_bar(scene, POINT, POINT, (1.0, 0.0, 0.0))
-    assert labels == ["1 cm"]

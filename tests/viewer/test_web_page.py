@@ -65,7 +65,7 @@ def page():
 def test_a_page_has_the_robot_the_stage_and_the_camera(page):
     messages = recorded_messages(page)
     names = {message.get("name") for message in messages}
-    assert {"/robot/1/visual0", "/ground", "/scale", "/light"} <= names
+    assert {"/robot/1/visual0", "/ground", "/light"} <= names
     kinds = {message["type"] for message in messages}
     assert {"EnvironmentMapMessage", "SetCameraPositionMessage"} <= kinds
     assert b"<title>an &lt;arm&gt;</title>" in page

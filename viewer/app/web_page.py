@@ -18,9 +18,7 @@ from morphgen.typing import Array
 from morphgen.viewer.app.server import AccessPolicy, start_server, stop_server
 from morphgen.viewer.scene.robot import add_robot, robot_bounds
 from morphgen.viewer.scene.stage import (
-    CAMERA_DIRECTION,
     add_ground,
-    add_scale_bar,
     place_camera,
     set_stage,
 )
@@ -50,7 +48,6 @@ def robot_page(robot: Robot, dark: bool = False) -> bytes:
     with scene_server() as server:
         set_stage(server.scene, dark=dark)
         add_ground(server.scene, float(np.linalg.norm(high - low)))
-        add_scale_bar(server.scene, low, high, CAMERA_DIRECTION)
         view = add_robot(server.scene, robot, "/robot")
         low, high = sweep_bounds(robot)
         place_camera(server.initial_camera, low, high)

@@ -623,7 +623,6 @@ class PopulationPage:
                 for i, (text, position) in enumerate(labels)
             ]
             stage.add_ground(client.scene, float(np.linalg.norm(high - low)))
-            stage.add_scale_bar(client.scene, low, high, CAMERA_DIRECTION)
             stage.look_at(client, low, high, CAMERA_DIRECTION)
         self.session.show_state()
 

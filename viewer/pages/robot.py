@@ -108,7 +108,6 @@ class RobotPage:
         scene, gui = session.client.scene, session.client.gui
         low, high = scene_robot.robot_bounds(robot)
         scene_stage.add_ground(scene, float(np.linalg.norm(high - low)))
-        scene_stage.add_scale_bar(scene, low, high, scene_stage.CAMERA_DIRECTION)
         scene_stage.look_at(session.client, low, high)
         self.view = scene_robot.add_robot(scene, robot, "/robot")
         self.q: Array = np.array(robot.home)  # independent joint positions (dof,) [rad or m]

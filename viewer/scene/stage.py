@@ -1,4 +1,4 @@
-"""The stage on which robots stand: light, background, ground, a scale bar, and the camera."""
+"""The stage on which robots stand: light, background, ground and camera."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def mesh_arrays(mesh: trimesh.Trimesh) -> Triangles:
 
 BRAND: Rgb = (24, 100, 171)  # colour of links, buttons and sliders
 CAMERA_DIRECTION = (0.72, -0.60, 0.34)  # to the camera, that of the thumbnails
-MIN_EXTENT = 0.05  # smallest extent by which axes, markers and the scale bar are drawn [m]
+MIN_EXTENT = 0.05  # smallest extent by which axes and markers are drawn [m]
 _BACKGROUNDS: dict[bool, tuple[Rgb, Rgb]] = {
     False: ((246, 248, 250), (206, 212, 219)),
     True: ((52, 57, 64), (24, 26, 30)),
@@ -127,8 +127,6 @@ _MAX_ASPECT = 1.2  # largest aspect of the picture that is used: panels may stil
 _STRIP_ASPECT, _PAGE_ASPECT = 0.3, 1.0
 """Aspect below which the picture is still the strip beside the panel of a gallery that the browser
 is leaving, and the aspect that is used instead."""
-_BAR_COLOURS: tuple[Rgb, Rgb] = ((33, 37, 41), (248, 249, 250))
-_BAR_PARTS = 10
 
 
 def set_stage(scene: viser.SceneApi, *, dark: bool) -> None:
@@ -168,42 +166,6 @@ def add_ground(scene: viser.SceneApi, size: float, height: float = 0.0) -> None:
         shadow_opacity=_SHADOW_OPACITY,
         position=(0.0, 0.0, height),
     )
-
-
-def add_scale_bar(
-    scene: viser.SceneApi, low: Array, high: Array, direction: tuple[float, float, float]
-) -> None:
-    """Draw a bar of 0.1, 0.2, 0.5, 1, ... m, as fits, on the ground in front of a box."""
-    extent = max(float((high - low).max()), MIN_EXTENT)  # a robot without shapes is a point
-    length = bar_length(0.3 * extent)
-    width, gap = 0.04 * length + 0.006 * extent, 0.08 * extent
-    y = float(low[1]) - gap if direction[1] < 0 else float(high[1]) + gap
-    x = float(low[0] + high[0] - length) / 2
-    part = length / _BAR_PARTS
-    centres = np.empty((_BAR_PARTS, 3))
-    centres[:, 0] = x + (np.arange(_BAR_PARTS) + 0.5) * part
-    centres[:, 1:] = y, width / 8
-    scene.add_batched_meshes_simple(
-        "/scale",
-        *triangles(Box((part, width, width / 4))),
-        batched_wxyzs=np.tile((1.0, 0.0, 0.0, 0.0), (_BAR_PARTS, 1)),
-        batched_positions=centres,
-        batched_colors=batch_colours([_BAR_COLOURS[i % 2] for i in range(_BAR_PARTS)]),
-        lod="off",
-        cast_shadow=False,
-    )
-    scene.add_label("/scale/label", length_text(length), position=(x + length + 0.4 * part, y, 0.0))
-
-
-def bar_length(longest: float) -> float:
-    """Return the largest of ..., 0.1, 0.2, 0.5, 1, 2, 5, ... m that is not above a length [m]."""
-    power = 10.0 ** math.floor(math.log10(longest))
-    return power * max(factor for factor in (1, 2, 5) if factor * power <= longest * (1 + 1e-9))
-
-
-def length_text(length: float) -> str:
-    """Return a length [m] in metres or, below one, in centimetres."""
-    return f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
 
 
 def look_at(
