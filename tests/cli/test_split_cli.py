@@ -113,7 +113,7 @@ def test_robots_that_were_left_out_are_counted_with_their_reason(ok):
     pattern = "arm={lwr,panda,kinova_gen3,ur5,arm3} ee={plane,stick}"
     options = ("--from", pattern, "--test", "2", "--max-links", "10", "--seed", "2")
     line = "  robots that were left out: 2 with more than 10 links"
-    assert line in ok(*HOLD_OUT, *options).splitlines()
+    assert line in ok(*HOLD_OUT[:-2], *options).splitlines()
 
 
 def test_several_train_sizes_write_one_file_each(run, ok):
