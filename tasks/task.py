@@ -151,6 +151,12 @@ class ObjectTaskConfig(TaskConfig):
     success_weight: float
     approach_weight: float
 
+    def __post_init__(self) -> None:
+        """Require a curriculum of one step or more."""
+        super().__post_init__()
+        if self.curriculum_steps < 1:
+            raise TaskError(f"a curriculum of {self.curriculum_steps} steps: expected 1 or more")
+
 
 class GoalSet:
     """Starts and goals of a robot's episodes: base of a frozen dataclass.

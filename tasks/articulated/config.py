@@ -57,8 +57,6 @@ class ArticulatedConfig(ObjectTaskConfig):
                 f"{type(self).__name__}: an object of {low:g} to {high:g} with friction "
                 f"{self.friction:g}, to be moved by {self.travel:g}: expected positive numbers"
             )
-        if self.curriculum_steps < 1:
-            raise TaskError(f"a curriculum of {self.curriculum_steps} steps: expected 1 or more")
         for name in ("arm_x", "free_x", "y"):
             least, most = getattr(self, name)
             if least > most:

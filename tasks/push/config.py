@@ -56,8 +56,6 @@ class PushConfig(ObjectTaskConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         low, high = self.block_size
-        if self.curriculum_steps < 1:
-            raise TaskError(f"a curriculum of {self.curriculum_steps} steps: expected 1 or more")
         if not (self.block_mass > 0 and self.friction >= 0):
             raise TaskError(
                 f"a block of {self.block_mass:g} kg with friction {self.friction:g}: expected a "

@@ -28,9 +28,10 @@ class KinematicSimulation(Simulation):
     the same bits whatever else is in the batch. Tools stay within 1 cm of MuJoCo's for 1 s in free
     space, as long as no motor would be at its effort limit.
 
-    Nothing collides: links pass through each other and through the ground. So there are no blocks
-    and no obstacles. Motors have no effort limits, and links no inertia: where a real motor would
-    be too weak, as when fast joints turn back at once, MuJoCo's joints lag behind these.
+    Nothing collides: links pass through each other and through the ground, so that no batch has
+    this simulator with blocks or obstacles. Motors have no effort limits, and links no inertia:
+    where a real motor would be too weak, as when fast joints turn back at once, MuJoCo's joints lag
+    behind these.
 
     Joints stay within their limits. Targets are clamped to them, and the response of the law to an
     impulse is never negative: a joint that starts at rest never passes the farthest target.
@@ -50,13 +51,6 @@ class KinematicSimulation(Simulation):
             raise SimulationError(
                 f"simulator 'kinematic' has no contacts: {contacts}; expected {NO_CONTACTS}"
             )
-        for env, scene in enumerate(scenes):
-            if scene.object is not None or scene.obstacles:
-                thing = "an object" if scene.object is not None else "obstacles"
-                raise SimulationError(
-                    f"{self._label(env)}: the scene has {thing}, and simulator 'kinematic' has no "
-                    "contacts; expected another simulator"
-                )
         robots = {id(scene.robot): scene.robot for scene in scenes}
         row_of_robot = {key: row for row, key in enumerate(robots)}
         rows = np.array([row_of_robot[id(scene.robot)] for scene in scenes])

@@ -120,12 +120,6 @@ def test_robot_that_is_no_such_object_is_refused():
             ArticulatedObject(faulty)
 
 
-def test_kinematic_simulator_refuses_an_object():
-    scenes, cpu = [Scene(rod(), object=door())], torch.device("cpu")
-    with pytest.raises(SimulationError, match="the scene has an object"):
-        SIMULATORS["kinematic"].load(scenes, None, 1, cpu)
-
-
 def test_shapes_of_an_object_are_in_the_frames_of_its_parts():
     thing = door()
     assert thing.base_shapes == (POST,)

@@ -29,10 +29,11 @@ from morphgen.tasks.goals import goal_sets
 from morphgen.tasks.goals.goal_sets import set_npz
 from morphgen.tasks.push import starts
 from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.push.starts import CLOSE, path_is_clear, push_region
+from morphgen.tasks.push.starts import push_region
 from morphgen.tasks.reach import task as module
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.task import REACH
+from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes import obstacles
 from morphgen.tasks.scenes.env_specs import GoalConfig
 from morphgen.tasks.scenes.obstacles import (
@@ -327,10 +328,8 @@ def sample_starts(words, cache, *, config=PUSH, **options):
     return draw_goals(robot(words), config, ground=0.0, cache=cache, **options)
 
 
-def space_of(words, push_set, layout=None):
-    boxes = () if layout is None else place_boxes(push_set.obstacles, push_set.layouts[layout])
-    scene = Scene(robot(words), object=push_set.block, obstacles=boxes, ground=push_set.ground)
-    return FreeSpace(scene)
+def space_of(words, push_set):
+    return FreeSpace(Scene(robot(words), object=push_set.block, ground=push_set.ground))
 
 
 @pytest.mark.parametrize("words", [*ARMS, *FREE, *SWEEPS, SHORT])
@@ -338,30 +337,19 @@ def space_of(words, push_set, layout=None):
 def test_every_block_can_be_pushed_across_the_line(words, boxes, cache):
     push_set = sample_starts(words, cache, obstacles=boxes)
     body, space = robot(words), space_of(words, push_set)
-    edge, x, y = push_set.block.size[0], *push_set.blocks[:, :2].T
+    edge, y = push_set.block.size[0], push_set.blocks[:, 1]
     assert len(push_set.obstacles) == (3 if boxes else 0)
     assert push_set.usable.shape == ((5, 5) if boxes else (0, 5))
-    for layout, usable in enumerate(push_set.usable):
-        among = space_of(words, push_set, layout)
-        assert usable.sum() >= 2
-        assert path_is_clear(among, push_set.line, push_set.blocks[usable]).all()
-        for q in (push_set.q, push_set.behind):
-            assert among.free(q[usable], push_set.blocks[usable]).all()
-        assert among.free(push_set.across[usable]).all()
+    scene = Scene(body, object=push_set.block, obstacles=push_set.obstacles)
+    assert TASKS["push"].certify(push_set, body, scene) == []
+    assert (push_set.usable.sum(axis=1) >= 2).all()
     assert 5 == push_set.accepted == len(push_set.q) <= push_set.tried
     assert push_set.blocks[:, 2] == pytest.approx(edge / 2)
     assert np.linalg.norm(push_set.blocks[:, 3:], axis=1) == pytest.approx(1.0)
     assert ((-0.2 * push_set.scale <= y) & (y <= -0.15 * push_set.scale)).all()
     assert push_set.line == pytest.approx(0.2 * push_set.scale)
-    for q in (push_set.q, push_set.behind, push_set.across):
-        assert ((q >= joint_limits(body)[:, 0]) & (q <= joint_limits(body)[:, 1])).all()
-    assert space.free(push_set.q, push_set.blocks).all()
-    assert space.free(push_set.behind, push_set.blocks).all()
-    assert space.free(push_set.across).all()
     behind, across = (frame_pose(body, q)[:, :3, 3] for q in (push_set.behind, push_set.across))
     assert (behind[:, 1] < y - edge / 2).all()
-    assert np.abs(behind[:, 0] - x).max() < CLOSE
-    assert np.abs(across[:, :2] - np.column_stack([x, np.full(5, push_set.line)])).max() < CLOSE
     for tools in (behind, across):
         assert ((tools[:, 2] > 0) & (tools[:, 2] < edge)).all()
     for share in np.linspace(0, 1, 9):

@@ -2,7 +2,6 @@
 
 import itertools
 from contextlib import closing
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from helpers.goal_sets import draw_spec
 from helpers.joint_targets import SECOND, full_speed, random_walk, smooth_walk
 from helpers.resets import put_home, reset_envs
 from helpers.robots import arm, finger
-from helpers.scenes import PAPER_ROBOTS, push_scene, reach_scene, robot
+from helpers.scenes import PAPER_ROBOTS, reach_scene, robot
 from morphgen.errors import SimulationError, TaskError
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.kinematics import forward_kinematics, frame_pose, joint_limits
@@ -157,13 +156,7 @@ def test_joints_without_limits_turn_on():
     assert sim.q[0, elbow] > 2 * np.pi
 
 
-@pytest.mark.parametrize(
-    ("scene", "thing"),
-    [(push_scene(), "an object"), (replace(push_scene(), object=None), "obstacles")],
-)
-def test_scenes_with_something_to_touch_are_refused(scene, thing):
-    with pytest.raises(SimulationError, match=f"environment 1 .*has {thing}"):
-        KinematicSimulation([reach_scene(), scene])
+def test_contacts_are_refused():
     for contacts in (Contacts(), Contacts(scene=False), Contacts(self_collision=False)):
         with pytest.raises(SimulationError, match="has no contacts"):
             KinematicSimulation([reach_scene()], contacts)

@@ -133,6 +133,7 @@ def test_steps_equal_those_of_the_batch(make, task, sim, kind):
         ("reach", {"robot": "arm=jaco2 ee=stick"}, True),  # joints without limits
         ("reach", {"robot": "planar-cube"}, True),  # slides
         ("reach", {"config": POSE}, False),
+        ("reach", {"observe": VELOCITY}, True),
         ("push", {"observe": ObservationConfig(points=5, state=False), "obstacles": True}, True),
     ],
 )
@@ -178,16 +179,6 @@ def test_all_channels_equal_those_of_the_batch(make, task, in_numpy):
     if not in_numpy:
         env._stepper = None
     run_both(env, batch, 1)
-
-
-@pytest.mark.parametrize("task", ["reach", "push"])
-def test_entries_in_numpy_equal_those_of_the_batch(make, task, monkeypatch):
-    env, batch = make(task, observe=VELOCITY)
-    env.reset(seed=0)
-    with monkeypatch.context() as patch:
-        patch.setattr(env.batch, "requested_entries", None)  # a step in NumPy does not call it
-        env.step(np.zeros(env.action_space.shape, np.float32))
-    run_both(env, batch, 2)
 
 
 def test_divergence_is_undone_as_in_the_batch(make):
