@@ -29,11 +29,12 @@ from morphgen.rl.demonstrations.recording import (
     PLANNER,
     RecordingConfig,
     best_of,
+    choose_episodes,
     read_planner,
     record_states,
+    replay,
 )
 from morphgen.rl.demonstrations.recording import record as record_episodes
-from morphgen.rl.demonstrations.replay import choose_episodes, replay
 from morphgen.rl.inference import read_controller
 from morphgen.rl.runs.checkpoint import CHECKPOINT, RunConfig
 from morphgen.rl.runs.robot_source import Source, drawn_source, other_side, tasks_of

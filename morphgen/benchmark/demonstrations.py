@@ -17,7 +17,7 @@ from morphgen.formats.data_files import read_json
 from morphgen.formats.files import folder_hashes
 from morphgen.rl.demonstrations.lerobot import BODIES, INFO, RECORDING, read_index
 from morphgen.rl.demonstrations.reader import Demonstrations
-from morphgen.rl.demonstrations.replay import Replay
+from morphgen.rl.demonstrations.recording import Replay
 from morphgen.rl.scores import Interval, success_interval
 from morphgen.tables import table
 

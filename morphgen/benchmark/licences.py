@@ -179,11 +179,7 @@ def licences_json(parts: Sequence[LicencedPart]) -> str:
 
 def licence_summary(parts: Sequence[LicencedPart]) -> str:
     """Return the licences in a sentence, with a line for each part whose licence restricts use."""
-    limits = [
-        f"**{part.part} is {part.licence.id} ({', '.join(part.licence.restrictions)})**: robots "
-        f"{', '.join(dict.fromkeys(name for _, name in part.robots))}."
-        for part in restricted(parts)
-    ]
+    limits = [f"Restricted: {restriction_text(part)}." for part in restricted(parts)]
     text = (
         f"The parts of the robots are under {', '.join(licence_ids(parts))}. "
         f"`{LICENCES_FILE}` lists parts, sources and robots."

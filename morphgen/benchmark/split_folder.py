@@ -58,8 +58,6 @@ BUILD_FILE = "build.json"
 SUMS_FILE = "SHA256SUMS"
 ARCHIVE_SUFFIX = ".zip"  # suffix of the archive of a release, see `morphgen.benchmark.release`
 
-FORMAT = 1  # version of the folder's layout
-
 _SUM = re.compile(r"([0-9a-f]{64})  (.+)")
 
 Record = dict[str, Any]  # a line of `robots.jsonl`

@@ -11,7 +11,7 @@ from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, training_progress
 from morphgen.cli.train import RESUME, print_run
 from morphgen.rl.demonstrations.reader import Demonstrations
-from morphgen.rl.demonstrations.replay import TOLERANCE
+from morphgen.rl.demonstrations.recording import TOLERANCE
 from morphgen.tables import table
 
 

@@ -165,10 +165,6 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
         """Return the features of a step."""
         return {name: values[frame] for name, values in self.columns.items()}
 
-    def __getitems__(self, frames: Sequence[int]) -> list[dict[str, torch.Tensor]]:
-        """Return the features of several steps, as ``DataLoader`` asks for them."""
-        return [self[frame] for frame in frames]
-
     @property
     def robots(self) -> tuple[Robot, ...]:
         """The robots, which ``robot_index`` refers to, with primitives as collision shapes."""

@@ -77,7 +77,8 @@ def test_a_restricted_licence_is_released_when_it_is_allowed(ok):
     shutil.unpack_archive("releases/composition-ee-arm-reach-1.0.0.zip", ".")
     card = Path("composition-ee-arm-reach-1.0.0/README.md").read_text()
     assert "- cc-by-nc-nd-4.0\n" in card
-    assert "**sake_ez is CC-BY-NC-ND-4.0 (non-commercial, no derivatives)**: robots ur5-ez" in card
+    limits = "(CC-BY-NC-ND-4.0: non-commercial, no derivatives)"
+    assert f"Restricted: sake_ez {limits} in robots ur5-ez." in card
 
 
 def test_show_names_restricted_parts(run):

@@ -22,8 +22,7 @@ from morphgen.rl.baselines import BASELINES
 from morphgen.rl.demonstrations import recording
 from morphgen.rl.demonstrations.cameras import DEPTH_MAX, DEPTH_MIN, DEPTH_SHIFT, depth_code
 from morphgen.rl.demonstrations.lerobot import BODIES, INFO, read_episodes
-from morphgen.rl.demonstrations.recording import RecordingConfig, record
-from morphgen.rl.demonstrations.replay import replay
+from morphgen.rl.demonstrations.recording import RecordingConfig, record, replay
 from morphgen.rl.inference import run_episodes
 from morphgen.rl.runs.robot_source import drawn_source, robot_source
 from morphgen.tasks.observation import ObservationConfig

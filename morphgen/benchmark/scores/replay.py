@@ -12,7 +12,7 @@ import numpy as np
 from morphgen.benchmark.scores.submission import Submission, protocol_from
 from morphgen.errors import BenchmarkError
 from morphgen.rl.baselines import BASELINES, Baseline
-from morphgen.rl.demonstrations.replay import TOLERANCE
+from morphgen.rl.demonstrations.recording import TOLERANCE
 from morphgen.rl.evaluation import EvalConfig, episodes_again
 from morphgen.rl.inference import Episode, Mode
 from morphgen.rl.runs.checkpoint import Interface, read_checkpoint
