@@ -150,7 +150,6 @@ class KinematicTree:
 
     joints: JointTensors
     """The joint that attaches each link to its parent, fixed for the root; K = L."""
-    is_link: torch.Tensor  # mask of the links, False for padding, shape (R, L), bool
     is_movable: torch.Tensor  # mask of the links whose joint is not fixed, shape (R, L), bool
     levels: tuple[tuple[torch.Tensor, torch.Tensor], ...]
     """For each depth from 1 on, the indices of the links at that depth and the columns of their
@@ -184,9 +183,8 @@ def compile_tree(
     links = max_links or most
     size = len(robots), links
     parents, depth, place, column = np.zeros((4, *size), dtype=np.int64)
-    is_link, movable = np.zeros((2, *size), dtype=np.bool_)
+    movable = np.zeros(size, dtype=np.bool_)
     for r, robot in enumerate(robots):
-        is_link[r, : len(robot.links)] = True
         movable[r, [k + 1 for k in robot.movable_joints]] = True
         for i, parent in enumerate(robot.parents[1:], 1):
             parents[r, i], depth[r, i] = parent, depth[r, parent] + 1
@@ -206,7 +204,6 @@ def compile_tree(
     ]
     return KinematicTree(
         joints=_joint_tensors(robots, rows, links, dtype, device, pad_front=False),
-        is_link=torch.from_numpy(is_link).to(device),
         is_movable=torch.from_numpy(movable).to(device),
         levels=tuple(levels),
         column=torch.from_numpy(column).to(device),
