@@ -9,18 +9,10 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
 
-from morphgen.errors import MissingDependencyError, TaskError
+from morphgen.errors import TaskError
 from morphgen.tasks.gym.vector import NumpyObservation, TaskVector
-
-try:
-    from stable_baselines3.common.vec_env import VecEnv
-except ModuleNotFoundError as error:
-    if error.name != "stable_baselines3":
-        raise
-    raise MissingDependencyError(
-        "stable-baselines3 is not installed: pip install stable-baselines3"
-    ) from error
 
 Indices = int | Iterable[int] | None
 

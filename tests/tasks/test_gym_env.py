@@ -6,9 +6,7 @@ import sys
 import warnings
 from contextlib import closing
 from functools import partial
-from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -24,7 +22,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
 import morphgen
-from morphgen.errors import CompositionError, MissingDependencyError, MorphgenError, TaskError
+from morphgen.errors import CompositionError, MorphgenError, TaskError
 from morphgen.progress import show_progress
 from morphgen.tasks import make_batch
 from morphgen.tasks.actions import BINS
@@ -576,21 +574,6 @@ def test_stable_baselines3_can_read_attributes(mixed_batch):
     assert seen in envs.vector.observation_space
     with pytest.raises(TaskError, match="share their attributes"):
         envs.set_attr("label", "y", indices=0)
-
-
-def test_missing_stable_baselines3_error_says_what_to_install(monkeypatch):
-    for name in list(sys.modules):
-        if name == "morphgen.tasks.gym.sb3" or name.startswith("stable_baselines3"):
-            monkeypatch.delitem(sys.modules, name)
-
-    def find_spec(name, *_):
-        if name == "stable_baselines3":
-            raise ModuleNotFoundError(name, name=name)
-
-    finder = SimpleNamespace(find_spec=find_spec)
-    monkeypatch.setattr(sys, "meta_path", [finder, *sys.meta_path])
-    with pytest.raises(MissingDependencyError, match="pip install stable-baselines3"):
-        import_module("morphgen.tasks.gym.sb3")
 
 
 def test_making_vectors_shows_progress_and_closed_ones_raise_a_clear_error():
