@@ -7,6 +7,7 @@ import os
 import re
 from dataclasses import asdict
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -243,7 +244,7 @@ def test_values_are_those_of_all_versions_with_the_same_minor_number(tmp_path):
 PAGE = (Path(__file__).parents[2] / "docs" / "versions.md").read_text(encoding="utf-8")
 FORMATS = {
     "NAME.yaml": split.FORMAT,
-    "build.json": split_folder.FORMAT,
+    "build.json": get_args(get_type_hints(split_folder._Settings)["format"])[0],
     "goals/index.json": split_goals.FORMAT,
     "card.json": bundle.CARD_FORMAT,
     "set.json": SetConfig(Path(), "", "", 0, (), False, False, ()).settings()["format"],
