@@ -308,6 +308,17 @@ def test_the_same_content_under_another_name_has_the_same_key(mesh, tmp_path):
     assert shapes_key([Shape(copy, TILTED)]) == shapes_key([Shape(mesh, TILTED)])
 
 
+def test_a_key_follows_the_working_directory(tmp_path, monkeypatch):
+    keys = set()
+    for name, size in (("a", 1.0), ("b", 2.0)):
+        (tmp_path / name).mkdir()
+        trimesh.creation.box((size,) * 3).export(tmp_path / name / "m.stl")
+        os.utime(tmp_path / name / "m.stl", ns=(1, 1))
+        monkeypatch.chdir(tmp_path / name)
+        keys.add(shapes_key([Shape(Mesh(Path("m.stl")))]))
+    assert len(keys) == 2
+
+
 def test_changes_of_the_solid_change_the_key(mesh):
     geometries = [
         mesh,
