@@ -186,9 +186,14 @@ def value_line(text: str | bytes, path: KeyPath) -> int:
 
 
 def dotted_values(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the values in nested dictionaries by their dotted names."""
+    """Return the values in nested dictionaries, and in lists of them, by their dotted names."""
     values: dict[str, Any] = {}
     for name, value in data.items():
-        is_nested = isinstance(value, dict) and value
-        values |= dotted_values(value, f"{prefix}{name}.") if is_nested else {prefix + name: value}
+        if isinstance(value, list) and value and all(isinstance(each, dict) for each in value):
+            entries = {f"{name}[{i}]": each for i, each in enumerate(value)}
+            values |= dotted_values(entries, prefix)
+        elif isinstance(value, dict) and value:
+            values |= dotted_values(value, f"{prefix}{name}.")
+        else:
+            values[prefix + name] = value
     return values
