@@ -128,9 +128,9 @@ _NOT_IN_NAMES = re.compile(r"[^\w.-]+")
 
 
 def change_tray(session: Session, action: str, uri: str) -> None:
-    """Do what a page's script asks for: an action of the page, or one of the tray."""
-    if action in session.actions:
-        session.actions[action](uri)
+    """Do what a page's script asks for: keep the open tabs, or an action of the tray."""
+    if action == "tab":
+        session.keep_tabs(uri)
     elif action == "choose":
         session.choose((*session.chosen, uri))
     elif action == "drop":

@@ -171,7 +171,6 @@ def open_page(session: Session, find_address: Callable[[], object]) -> None:
             session.chosen = tuple(filter(None, address.subjects))
         session.tabs = address.state.get("tab", "")
         session.address = replace(address, chosen=()).with_state(theme="", tab="")
-        session.actions["tab"] = session.keep_tabs
         session.show_address(session.title)
         session.show_tray()
         load_page(address.page)(session)

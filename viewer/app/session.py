@@ -70,9 +70,6 @@ class Session:
     title: str = field(init=False, default="morphgen")  # title of the browser's tab
     tabs: str = field(init=False, default="")
     """Titles of the open tabs, separated by commas; those that are open at first are left out."""
-    actions: dict[str, Callable[[str], object]] = field(init=False, default_factory=dict)
-    """Actions of elements with ``data-do`` in the page's HTML, by name, beside those of the tray;
-    called with the element's ``data-value``."""
     on_choice: Work | None = field(init=False, default=None)  # called after a choice
     values: dict[str, tuple[Callable[[], str], Callable[[str], object] | None]] = field(
         init=False, default_factory=dict
