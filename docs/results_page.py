@@ -39,6 +39,13 @@ STUDIES = ("reach-30m", "reach-30m-4epochs", "reach-100m", "push-30m")
 TASKS = ("reach", "reach-obstacles", "push", "push-obstacles")
 EE_TASK = "composition/ee-task"
 """The split whose robots have different tasks."""
+EE_TASK_STUDIES = {
+    "ee-task-30m": "",
+    "ee-task-20m": "",
+    "ee-task-contact": ", channels `contact` and `pace`",
+}
+"""What the policies of a study see besides their agent's channels."""
+SHIPPED_PUSH = "zero-shot-push"  # it has trained on other robots than those of the split
 SPLITS = (
     "interpolation/arm3",
     "interpolation/panda",
@@ -183,21 +190,25 @@ def objects_table() -> str:
 def ee_task_table() -> str:
     """Return success of the split in which robots have different tasks, by side and task."""
     push, reach = (
-        results_of("ee-task-30m", EE_TASK, task) | results_of("ee-task-20m", EE_TASK, task)
+        {
+            (*key, note): row
+            for study, note in EE_TASK_STUDIES.items()
+            for key, row in results_of(study, EE_TASK, task).items()
+        }
         for task in ("push", "reach")
     )
-    order = [*AGENTS, *BASELINES]
+    order = [*AGENTS, SHIPPED_PUSH, *BASELINES]
     lines = []
     keys = [key for key in {*push, *reach} if key[0] in order]
-    for key in sorted(keys, key=lambda key: (order.index(key[0]), key[1])):
-        agent, steps = key
+    for key in sorted(keys, key=lambda key: (order.index(key[0]), key[1:])):
+        agent, steps, note = key
         rows = [found[key] for found in (push, reach) if key in found]
         pushing, reaching = (found[key].sides if key in found else {} for found in (push, reach))
         seeds = max(len(row.seeds) for row in rows)
         columns = (pushing.get("train"), reaching.get("train"), pushing.get("test"))
         rates = [column.success.as_percent() if column else "" for column in columns]
         score = f"{reaching['train'].score.value:.1f}" if reaching else ""
-        lines.append([*_run_cells(agent, steps, seeds), rates[0], score, *rates[1:]])
+        lines.append([*_run_cells(agent, steps, seeds, note), rates[0], score, *rates[1:]])
     headers = ["agent", "transitions", "seeds", "MT, push", "MT, reach", "success", "ZS, push"]
     return tabulate(lines, headers=headers, tablefmt="github", disable_numparse=True)
 
@@ -205,7 +216,7 @@ def ee_task_table() -> str:
 def seeds_table() -> str:
     """Return the splits of each study on which an agent has one seed, or no run as others have."""
     lines = []
-    for study in (*STUDIES, "ee-task-30m", "ee-task-20m", "objects-30m", "reach-24m"):
+    for study in (*STUDIES, *EE_TASK_STUDIES, "objects-30m", "reach-24m"):
         seeds: dict[str, dict[str, set[int]]] = {}
         for row in rows_of(study):
             if row.method in AGENTS and row.transitions:
@@ -287,7 +298,7 @@ def tolerance_table() -> str:
 
 def _run_cells(agent: str, steps: int, seeds: int, note: str = "") -> list[str]:
     """Return agent, transitions and seeds; the latter two are empty for a baseline."""
-    name = AGENTS.get(agent, f"`{agent}`") + note
+    name = AGENTS.get(agent, f"`{agent}`") + (note if agent in AGENTS else "")
     share = " a robot" if agent.startswith("se") else ""
     return [name, *([f"{round(steps / 1e6)} million{share}", str(seeds)] if steps else ["", ""])]
 
