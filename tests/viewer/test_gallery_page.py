@@ -18,6 +18,7 @@ from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
 from morphgen.model.geometry import Capsule, Shape
 from morphgen.model.kinematics import forward_kinematics, joint_limits
+from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Link, Robot
 from morphgen.splits.split_file import find_split, read_split
 from morphgen.viewer.app.address import AddressError, parse_address
@@ -198,6 +199,15 @@ def test_a_capsule_is_a_cylinder_and_two_balls():
     assert len(pill.instances.robot) == 3
     heights = sorted(shape_poses(pill, pill.home)[:, 2, 3])
     np.testing.assert_allclose(heights, (-0.2, 0.0, 0.2), atol=1e-6)
+
+
+def test_large_meshes_are_simplified_although_their_arrays_are_read_only():
+    links = robot_of("arm=panda ee=none").links
+    shapes = [shape.geometry for link in links for shape in link.visuals]
+    large = next(shape for shape in shapes if len(load_mesh(shape).faces) > populations.MAX_FACES)
+    for array in (load_mesh(large).vertices, load_mesh(large).faces):
+        array.flags.writeable = False
+    assert len(populations.surface(large)[1]) <= populations.MAX_FACES
 
 
 def test_a_role_moves_in_every_robot_by_the_same_share(population):

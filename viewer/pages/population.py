@@ -271,7 +271,10 @@ def surface(prototype: Prototype) -> stage.Triangles:
             loaded = load_mesh(mesh)
             if len(loaded.faces) <= MAX_FACES:
                 return stage.triangles(mesh)
-            simple = loaded.simplify_quadric_decimation(face_count=MAX_FACES)
+            # Arrays of meshes are read-only, which the simplification refuses.
+            arrays = np.array(loaded.vertices), np.array(loaded.faces)
+            copy = trimesh.Trimesh(*arrays, process=False)
+            simple = copy.simplify_quadric_decimation(face_count=MAX_FACES)
             return stage.mesh_arrays(trimesh.graph.smooth_shade(simple, angle=stage.SHARP_ANGLE))
 
 
