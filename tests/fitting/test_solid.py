@@ -2,13 +2,14 @@
 
 import math
 
+import igl
 import numpy as np
 import pytest
 import trimesh
 
 from morphgen.errors import FitError, MeshError
 from morphgen.fitting import solid as module
-from morphgen.fitting.solid import solid_of, solid_of_mesh
+from morphgen.fitting.solid import Solid, _Columns, solid_of, solid_of_mesh
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere, volume
 
 SIZE = (0.2, 0.3, 0.4)
@@ -60,6 +61,15 @@ def angle():
     return trimesh.Trimesh(vertices, [*cap[:, ::-1], *(cap + 6), *walls])
 
 
+def half_tube(n=24):
+    """A strip bent around z by half a turn, with a radius of 0.2 and a width of 0.4."""
+    turns = np.linspace(0, math.pi, n)
+    vertices = [(0.2 * math.cos(a), 0.2 * math.sin(a), z) for a in turns for z in (-0.2, 0.2)]
+    firsts = [2 * i for i in range(n - 1)]
+    faces = [three for i in firsts for three in ((i, i + 2, i + 1), (i + 1, i + 2, i + 3))]
+    return trimesh.Trimesh(vertices, faces)
+
+
 def test_a_closed_box_is_its_own_solid():
     solid = solid_of_mesh(box())
     assert (solid.method, solid.decimated_from) == ("watertight", None)
@@ -74,6 +84,20 @@ def test_the_solid_of_an_l_is_not_its_convex_hull():
     assert solid.method == "watertight"
     assert counted(solid) == pytest.approx(0.014, rel=1e-9)
     assert solid.contains(np.array([(-0.15, 0.1, 0), (0, 0, 0)])).tolist() == [True, False]
+
+
+def test_crossings_of_closed_triangles_give_their_winding_numbers():
+    """The peer sums the solid angles of triangles; the parts overlap, nest and touch."""
+    tilted = box((0.3, 0.1, 0.2)).apply_transform(TILTED.matrix)
+    parts = [angle(), tilted, trimesh.creation.icosphere(3, 0.12), box((0.1,) * 3)]
+    mesh = trimesh.util.concatenate([*parts, box((0.1,) * 3, (0.1, 0, 0), inverted=True)])
+    solid = Solid(mesh, "watertight")
+    points = np.random.default_rng(0).uniform(*mesh.bounds, (20_000, 3))
+    expected = igl.fast_winding_number(mesh.vertices, mesh.faces, points)
+    counted = _Columns(mesh).winding(points)
+    assert {-1, 0, 1, 2, 3} <= {*counted}
+    np.testing.assert_array_equal(counted, expected.round())
+    np.testing.assert_array_equal(solid.contains(points), expected > 0.5)
 
 
 @pytest.mark.parametrize("flipped", [1, 4, 7, 10, 12])
@@ -159,6 +183,19 @@ def test_a_sphere_with_many_holes_is_solid_by_winding_number(inverted):
     assert not solid.mesh.is_watertight
     assert solid.contains(np.zeros((1, 3))).all()
     assert counted(solid) == pytest.approx(volume(Sphere(0.2)), rel=0.05)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_half_a_tube_is_solid_by_winding_number(turned):
+    mesh = half_tube()
+    if turned:
+        mesh.invert()
+    solid = solid_of_mesh(mesh)
+    assert solid.method == "winding"
+    inside = GRID[solid.contains(GRID)]
+    assert inside[:, 1].min() > 0
+    assert np.linalg.norm(inside[:, :2], axis=1).max() < 0.2
+    assert 0.3 < counted(solid) / (math.pi * 0.2**2 / 2 * 0.4) < 1
 
 
 def test_a_sheet_that_encloses_almost_nothing_becomes_its_convex_hull():
