@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -71,11 +72,11 @@ def states(page: Any, address: str) -> Iterator[str]:  # noqa: ANN401
     page.get_by_role("link", name="Edit in Compose").click()
     page.get_by_text("DoF").first.wait_for()
     yield "in Compose"
-    slider, before = page.get_by_role("slider").first, page.url
+    slider = page.get_by_role("slider").first
     slider.focus()
     for _ in range(60):
         slider.press("ArrowRight")
-    page.wait_for_url(lambda url: url != before)
+    page.get_by_text(re.compile("changed: ")).first.wait_for()
     yield "edited"
     page.get_by_role("tab", name="Get").click()
     page.get_by_role("button", name="Write to robots/").click()

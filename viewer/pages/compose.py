@@ -5,9 +5,11 @@ from __future__ import annotations
 import functools
 import re
 import shlex
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +29,7 @@ from morphgen.grammar.request import MAIN_PORTS, SLOTS, default_name, known_gram
 from morphgen.grammar.robot_set import GRAMMAR
 from morphgen.grammar.sampling import sample_robot
 from morphgen.model.inertia import box_corners
+from morphgen.model.kinematics import arm_reach
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
 from morphgen.viewer import markup
@@ -518,11 +521,12 @@ class ComposePage:
     def show(self, shown: Shown) -> None:
         """Show a robot in place of the previous one, and check it in the background."""
         session, self.shown = self._session, shown
-        self._view.replace_robot(shown.robot)
+        change = self._view.replace_robot(shown.robot)
         self._summary.content = summary(
             shown.robot,
             f" · {markup.link(Address('robot', (shown.uri,)), 'open its page')} · "
-            + markup.choose_box(shown.uri, "choose"),
+            + markup.choose_box(shown.uri, "choose")
+            + (f"<br>changed: {escape(change)}" if change else ""),
         )
         self._command.content = markup.framed(
             markup.command(shown.command), "<h3>Derivation</h3>", markup.code(str(shown.derivation))
@@ -569,25 +573,36 @@ def _write_checked(robot: Robot, folder: Path) -> None:
     write_bundle(robot, folder, check(robot))
 
 
+GHOST_OPACITY = 0.16  # opacity of the previous robot
+GESTURE_TIME = 1.0  # changes that follow each other faster, as of a slider, count as one [s]
 _EDGE = 0.02  # share of the picture at its edges into which a robot may not reach
 
 
 class ComposeView:
-    """The robot in the scene of one browser."""
+    """The robot in the scene of one browser, and the ghost of the one before."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
         self._shown: RobotView | None = None
+        self._ghost: RobotView | None = None
+        self._changed_at = -np.inf  # time of the last change by `time.monotonic` [s]
         self._count = 0  # number of robots shown so far; names the nodes of the scene
 
-    def replace_robot(self, robot: Robot) -> None:
-        """Show a robot in place of the one before, and move the camera only if it is needed."""
+    def replace_robot(self, robot: Robot) -> str:
+        """Show a robot, and the one before as ghost; return what changed, or an empty text."""
         client, previous, robot = self._session.client, self._shown, split_colours(robot)
+        is_gesture = time.monotonic() - self._changed_at < GESTURE_TIME
         with client.atomic():
             self._count += 1
             self._shown = add_robot(client.scene, robot, f"/robot{self._count}")
-            if previous is not None:
+            if previous is not None and is_gesture and self._ghost is not None:
                 previous.base.remove()
+            elif previous is not None:
+                if self._ghost is not None:
+                    self._ghost.base.remove()
+                self._ghost = previous
+                previous.set_opacity(GHOST_OPACITY)
+                previous.cast_no_shadow()
         low, high = robot_bounds(robot)
         add_ground(client.scene, float(np.linalg.norm(high - low)))
         if previous is None:
@@ -595,9 +610,25 @@ class ComposeView:
         elif not self._is_in_picture(low, high):
             x, y, z = (client.camera.position - client.camera.look_at).tolist()
             look_at(client, low, high, (x, y, z) if np.hypot(x, y) > 1e-6 else CAMERA_DIRECTION)
+        self._changed_at = time.monotonic()
+        return change_text(self._ghost.robot, robot) if self._ghost else ""
 
     def _is_in_picture(self, low: Array, high: Array) -> bool:
         picture = camera_view(self._session.client)
         points, depths = project_points(picture, box_corners(low, high))
         shares = points / (picture.aspect, 1.0)
         return bool((depths > 0).all() and (abs(shares - 0.5) <= 0.5 - _EDGE).all())
+
+
+def change_text(before: Robot, after: Robot) -> str:
+    """Return what differs between two robots, such as ``reach 1.08 to 1.68 m, mass +0.24 kg``."""
+    parts = []
+    if before.dof != after.dof:
+        parts.append(f"{before.dof} to {after.dof} DoF")
+    if all(robot.tool and robot.dof for robot in (before, after)):
+        old, new = (f"{arm_reach(robot):.2f}" for robot in (before, after))
+        if old != new:
+            parts.append(f"reach {old} to {new} m")
+    if abs(difference := after.mass - before.mass) >= 0.005:
+        parts.append(f"mass {difference:+.2f} kg")
+    return ", ".join(parts)

@@ -126,6 +126,11 @@ class RobotView:
         for shape in self._shapes("visual"):
             shape.handle.opacity = None if opacity >= 1 else opacity
 
+    def cast_no_shadow(self) -> None:
+        """Let the visual shapes cast no shadow."""
+        for shape in self._shapes("visual"):
+            shape.handle.cast_shadow = False
+
     def paint_red(self, names: Collection[str]) -> None:
         """Paint the named links red, and the other links in their own colours."""
         if (names := frozenset(names)) == self.red:
