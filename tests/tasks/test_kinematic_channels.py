@@ -103,7 +103,7 @@ def test_the_dls_step_of_small_errors_reaches_the_goal(specs):
 
 def test_equal_joints_look_equal_whatever_the_convention_of_frames(specs):
     """A robot whose joint frames are turned about the origin, with axes to match, is the same."""
-    robot = specs[1].robot
+    robot = specs[0].robot
     turn = Pose.from_xyz_rpy((0.0, 0.0, 0.0), (0.4, -0.3, 1.1))
     turned = _with_turned_frames(robot, turn)
     np.testing.assert_allclose(
@@ -113,7 +113,7 @@ def test_equal_joints_look_equal_whatever_the_convention_of_frames(specs):
     )
     rows = []
     for same in (robot, turned):
-        spec = replace(specs[1], robot=same, scene=replace(specs[1].scene, robot=same))
+        spec = replace(specs[0], robot=same, scene=replace(specs[0].scene, robot=same))
         batch = batch_from_specs([spec], 1, sim="kinematic", observe=ALL, seed=0)
         rows.append(batch.reset())
     for name in ("joint", "jacobian", "dls", "lag"):
