@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 
 import morphgen
@@ -19,7 +17,6 @@ from morphgen.benchmark.generate import (
     interpolation,
 )
 from morphgen.benchmark.regimes import (
-    ON_HULL,
     combination,
     hull_distance,
     parameters,
@@ -292,18 +289,6 @@ def test_constant_parameters_are_ignored_unless_they_differ():
     assert hull_distance((0.5, 5.0, 1e-3), flat) == pytest.approx(0.5), "off the line of the two"
     assert hull_distance((0.0, 5.0), [(0.0, 5.0)]) == 0
     assert hull_distance((0.1, 5.0), [(0.0, 5.0)]) == np.inf
-
-
-@pytest.mark.slow
-@settings(max_examples=60)
-@given(st.integers(0, 2**32 - 1), st.integers(2, 4), st.integers(6, 40), st.floats(0.4, 1.4))
-def test_points_inside_the_hull_agree_with_a_delaunay_triangulation(seed, d, n, spread):
-    rng = np.random.default_rng(seed)
-    points = rng.random((n, d)) * 10.0 ** rng.integers(-3, 3, d)
-    centre = points.mean(axis=0)
-    point = centre + spread * (points[0] - centre) * rng.random(d)
-    inside = Delaunay(points, qhull_options="Qbb Qc Qz Q12 QbB").find_simplex(point) >= 0
-    assert (hull_distance(point, points) <= ON_HULL) == inside
 
 
 ARM3 = "arm=arm3 arm.length={} ee=claw"

@@ -10,7 +10,6 @@ from helpers.grammars import grammar
 from helpers.splits import member, split
 from morphgen.benchmark.audit import audit
 from morphgen.benchmark.hold_out import (
-    held_out_parts,
     hold_out,
     hold_out_findings,
     parse_rules,
@@ -277,12 +276,6 @@ def test_the_text_of_a_rule_gives_the_same_rule():
     rules = parse_rules([f"{texts},arm=ur5+ee=plane"], LIBRARY)
     assert parse_rules([str(rule) for rule in rules], LIBRARY) == rules
     assert [str(rule) for rule in rules][2:] == ["arm.manufacturer=ABB", "arm=ur5+ee=plane"]
-
-
-def test_only_rules_of_one_part_hold_out_the_part_itself():
-    rules = parse_rules(["ee=stick", "arm=lwr+ee=plane"], LIBRARY)
-    assert held_out_parts(rules, robot("arm=lwr ee=stick"), LIBRARY) == {"stick"}
-    assert held_out_parts(rules, robot("arm=lwr ee=plane"), LIBRARY) == set()
 
 
 @pytest.mark.parametrize(

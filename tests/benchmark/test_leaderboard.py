@@ -41,8 +41,6 @@ from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import default_library
 from morphgen.rl.scores import (
     smallest_rate_difference,
-    stratified_mean_interval,
-    success_interval,
 )
 
 LIBRARY = default_library()
@@ -63,24 +61,6 @@ def stored(folder, **submissions):
     for name, values in submissions.items():
         (folder / f"{name}.json").write_text(json.dumps(values))
     return [folder / f"{name}.json" for name in submissions]
-
-
-def test_scores_are_computed_from_the_episodes():
-    row = score_submission(submission())
-    assert (row.method, row.source, row.seeds) == ("ours", "submission", (0,))
-    train, test = (row.sides[side] for side in ("train", "test"))
-    assert (len(row.sides), train.robots, test.robots, test.episodes) == (2, 2, 1, 4)
-    relative = np.array([150, 151, 152, -1]) + 2
-    assert (test.score.value, test.success) == (relative.mean(), success_interval(0.75, 4))
-    assert test.score == stratified_mean_interval([relative])
-    assert train.score.value == relative.mean()
-    assert test.score.high - test.score.low > train.score.high - train.score.low > 0
-
-
-def test_a_method_has_one_run_of_a_seed():
-    runs = {"a": submission(), "b": submission(data(near=9.0))}
-    with pytest.raises(BenchmarkError, match="b: the same run, seed and mode as a with other epis"):
-        scored_rows(runs)
 
 
 def test_the_floor_and_the_smallest_difference_are_computed():

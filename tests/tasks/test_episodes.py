@@ -20,7 +20,7 @@ from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.observation import NOISE, ObservationConfig, observation_config
 from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.random_numbers import MAX_SEED, EpisodeRandom, EpisodeSequence, Stream, philox
+from morphgen.tasks.random_numbers import EpisodeRandom, EpisodeSequence, Stream, philox
 from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.render.renderer import render_state
 from morphgen.tasks.scenes.make import batch_from_specs, make_batch
@@ -513,45 +513,12 @@ def test_numbers_are_uniform():
     assert correlation.abs().max() < BOUND * MANY**-0.5
 
 
-def test_integers_are_uniform_below_their_bounds():
-    high = torch.tensor([1, 2, 3, 7, 100]).repeat(MANY // 5)
-    drawn = numbers(len(high)).integers(Stream.START, high)
-    assert drawn.dtype == torch.int64
-    assert (drawn < high).all()
-    for bound in (1, 2, 3, 7, 100):
-        counts = torch.bincount(drawn[high == bound], minlength=bound)
-        expected = len(high) / 5 / bound
-        assert (counts - expected).abs().max() <= BOUND * expected**0.5
-    assert not numbers(4).integers(Stream.START, torch.zeros(4, 2, dtype=torch.int64)).any()
-
-
 @pytest.mark.parametrize("change", [{"seed": 1}, {"seed": 2**32}, {"first": 5}, {"episode": 1}])
 def test_numbers_depend_on_seed_environment_and_episode(change):
     one, other = numbers(50), numbers(50, **change)
     assert not torch.equal(one.uniform(Stream.START, 4), other.uniform(Stream.START, 4))
     assert not torch.equal(one.uniform(Stream.START, 4), one.uniform(Stream.LAYOUT, 4))
     assert not torch.equal(one.uniform(Stream.START, 4), one.uniform(Stream.TASK + 1, 4))
-
-
-def test_numbers_do_not_depend_on_other_rows_or_on_how_many_are_drawn():
-    whole = numbers(40, seed=7)
-    rows = torch.tensor([3, 21, 20])
-    part = whole.select(rows)
-    drawn = whole.uniform(Stream.POINTS, 11)
-    assert torch.equal(part.uniform(Stream.POINTS, 11), drawn[rows])
-    assert torch.equal(whole.uniform(Stream.POINTS, 3), drawn[:, :3])
-
-
-def test_environments_begin_one_episode_after_the_other():
-    numbers_of = torch.arange(3, 7)
-    sequence = EpisodeSequence(MAX_SEED, numbers_of)
-    first = sequence.begin(torch.tensor([True, False, True, False]))
-    second = sequence.begin(torch.tensor([True, True, False, False]))
-    assert first.episode.tolist() == [0, 0, 0, 0]
-    assert second.episode.tolist() == [1, 0, 1, 0]
-    assert sequence.next_episode.tolist() == [2, 1, 1, 0]
-    plain = EpisodeRandom(MAX_SEED, numbers_of, second.episode)
-    assert torch.equal(second.uniform(Stream.START, 9), plain.uniform(Stream.START, 9))
 
 
 @pytest.mark.parametrize("seed", [-1, 2**64])

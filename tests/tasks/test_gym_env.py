@@ -482,17 +482,6 @@ def mixed_batch(cache, opened):
     return lambda **options: opened(make_batch(["reach", "push"], **given | options))
 
 
-@pytest.mark.parametrize("kind", ["continuous", "discrete"])
-def test_spaces_contain_observations_and_actions(mixed_batch, kind):
-    envs = TaskVector(mixed_batch(kind=kind))
-    links = int(envs.batch.action_mask.any(dim=0).sum())  # without those that no robot has
-    space = envs.single_action_space
-    assert space.shape == (links,)
-    assert kind == "continuous" or space.nvec.tolist() == [len(BINS)] * links
-    assert "obstacles" in envs.single_observation_space.spaces
-    run(envs)
-
-
 def test_autoreset_returns_the_final_observation(mixed_batch):
     envs = TaskVector(mixed_batch())
     assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
