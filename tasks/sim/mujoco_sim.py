@@ -287,9 +287,9 @@ class MujocoSimulation(HostSimulation):
             self._state.read()
         return {*self._state.diverged(), *refused}
 
-    def _run_threads(self) -> dict[int, str]:
-        """Step all environments; return the ones that MuJoCo could not step, with its reasons."""
-        work, refused = iter(self._work), dict[int, str]()
+    def _run_threads(self) -> set[int]:
+        """Step all environments; return the ones that MuJoCo could not step."""
+        work, refused = iter(self._work), set[int]()
         if self._pool is None:
             _drain(work, refused)
             return refused
@@ -303,15 +303,15 @@ class MujocoSimulation(HostSimulation):
         return refused
 
 
-def _drain(work: Iterator[Work], refused: dict[int, str]) -> None:
+def _drain(work: Iterator[Work], refused: set[int]) -> None:
     """Step environments until none is left; several threads may share both arguments."""
     for env, model, data, actuators, controls, torques, applied in work:
         actuators[:] = controls
         torques[:] = applied
         try:
             mujoco.mj_step(model, data, nstep=SUBSTEPS)
-        except mujoco.FatalError as error:  # its stack is full
-            refused[env] = f"MuJoCo: {str(error).splitlines()[0]}"
+        except mujoco.FatalError:  # its stack is full
+            refused.add(env)
 
 
 SIMULATOR = Simulator(

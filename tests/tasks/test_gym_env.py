@@ -563,6 +563,9 @@ def test_stable_baselines3_can_read_attributes(mixed_batch):
     assert seen in envs.vector.observation_space
     with pytest.raises(TaskError, match="share their attributes"):
         envs.set_attr("label", "y", indices=0)
+    envs.set_options({"goal": 1})  # stable-baselines3 hands them to the next reset
+    with pytest.raises(TaskError, match="goal"):
+        envs.reset()
 
 
 def test_making_vectors_shows_progress_and_closed_ones_raise_a_clear_error():
