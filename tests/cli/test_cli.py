@@ -33,8 +33,6 @@ from morphgen.rl.config import SWITCHES
 from morphgen.tasks.registry import Registry
 from morphgen.tasks.scenes.env_specs import load_robot
 
-COMMANDS = ("compose", "list", "show", "check", "import", "conform", "view")
-
 
 def test_compose_writes_a_bundle_and_prints_its_summary(ok, tmp_path):
     out = ok("compose", "base=gantry", "ee=plane", "--out", "robots")
@@ -63,7 +61,7 @@ def test_list_prints_one_row_per_part(ok):
         ["list", "arms"],
         ["split", "list"],
         ["grammar", "list"],
-        ["conform", "gantry-plane"],
+        ["conform", "gantry-plane", "--samples", "2"],
         ["tokens", "--layout"],
     ],
 )
@@ -235,14 +233,6 @@ def test_conform_fails_for_a_bundle_whose_files_disagree(run, tmp_path):
     code, out, _ = run("conform", folder, "--samples", "2")
     assert code == 1
     assert "lacks joints elbow" in out
-
-
-def test_help_names_every_command(capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["--help"])
-    assert stop.value.code == 0
-    listed = capsys.readouterr().out
-    assert all(f"    {command} " in listed for command in COMMANDS)
 
 
 def test_the_help_of_a_first_use_is_short(capsys):

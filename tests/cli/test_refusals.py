@@ -14,7 +14,6 @@ import morphgen
 from helpers.commands import start, tree
 from helpers.mjcf import TWO_JOINTS
 from helpers.mjcf import write as write_mjcf
-from helpers.parts import write_part
 from helpers.robots import arm
 from helpers.runs import RUN, SMALL, small_split
 from helpers.splits import TRAIN, combined, member
@@ -269,13 +268,6 @@ def test_errors_are_printed_as_json_with_the_json_option(run):
     data = json.loads(out)
     assert data["error"] == "PartError"
     assert err == f"morphgen: {data['message']}\n"
-
-
-def test_missing_data_package_error_says_how_to_install_it(refused, tmp_path):
-    source = {"package": "no-such-data", "file": "x.urdf"}
-    write_part(tmp_path, source=source, file=None, density=None, parameters=None)
-    message = refused("compose", "base=gantry", "ee=pincer", "--library", ".")
-    assert "'x.urdf' is part of 'no-such-data', not installed: pip install no-such-data" in message
 
 
 @pytest.mark.parametrize(

@@ -463,25 +463,17 @@ def test_each_variant_has_a_policy_and_controllers_to_compare(options, controlle
     assert ("score" in head) == ("--task" not in options)  # others count successes alone
 
 
-def test_results_are_beside_controllers_that_do_not_learn(ok):
-    rows = json.loads(ok("zeroshot", "arm3-stick", "--episodes", "1", "--json"))
-    assert [row["controller"] for row in rows] == ["zero-shot", "ik", "jacobian", "random"]
-    for row in rows:
-        assert row["episodes"] == 1
-        assert row["success"]["low"] <= row["success"]["value"] <= row["success"]["high"]
-
-
 def test_a_table_follows_the_episodes_of_each_controller(run, monkeypatch):
     for name in ("FIRST_LINE", "LINE_INTERVAL"):
         monkeypatch.setattr(progress, name, -1.0)
-    code, out, err = run("zeroshot", "arm3-stick", "--episodes", "2")
+    code, out, err = run("zeroshot", "arm3-stick", "--episodes", "1")
     controllers = ["zero-shot", "ik", "jacobian", "random"]
     head, _, *rows = out.splitlines()
     assert (code, head.split()) == (0, ["controller", "success", "distance", "[m]", "score"])
     assert [row.split()[0] for row in rows] == controllers
     assert float(rows[1].split()[-2]) < 0.03 < float(rows[-1].split()[-2])  # ik, random [m]
     assert float(rows[-1].split()[-1]) == 0  # scores are relative to it
-    ended = re.findall(r"(?m)^(\S+): 2 of 2 episodes, \d+ s$", err)
+    ended = re.findall(r"(?m)^(\S+): 1 of 1 episodes, \d+ s$", err)
     assert list(dict.fromkeys(ended)) == controllers
 
 

@@ -164,12 +164,6 @@ def test_the_first_axis_varies_most_and_its_farthest_point_is_on_the_right():
     assert embedding.points[:, 0].max() == np.abs(embedding.points[:, 0]).max()
 
 
-def test_the_share_of_the_variation_excludes_further_dimensions():
-    box = np.array([[x, y, z] for x in (0, 3) for y in (0, 2) for z in (0, 1)], dtype=float)
-    embedding = classical_mds(apart(box))
-    assert embedding.kept == pytest.approx((9 + 4) / (9 + 4 + 1))
-
-
 def test_non_euclidean_distances_reduce_the_share():
     star = np.array([[0, 1, 1, 1], [1, 0, 2, 2], [1, 2, 0, 2], [1, 2, 2, 0]], dtype=float)
     values = np.linalg.eigvalsh(-(np.eye(4) - 0.25) @ (star**2) @ (np.eye(4) - 0.25) / 2)

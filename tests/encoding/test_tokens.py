@@ -16,7 +16,6 @@ from morphgen.encoding.tokens import (
     MAX_LINKS,
     TOKEN_SIZE,
     encode_joint_positions,
-    encode_position,
     normalize_positions,
     pad_tokens,
     tokens,
@@ -112,13 +111,6 @@ def test_q_is_normalized_by_the_joint_limits(robot, q, x):
     x = normalize_positions(arm(), q)  # the last joint mimics the fourth
     np.testing.assert_allclose(x[:, 3], (q[:, 3] - 0.02) / 0.02)
     np.testing.assert_allclose(x[:, 4], (-q[:, 3] + 0.02) / 0.02)
-
-
-def test_position_codes_are_unique():
-    x = np.linspace(-1, 1, 2001)
-    code = encode_position(x)
-    assert len({tuple(row) for row in code.round(6).tolist()}) == len(x)
-    assert np.abs(code[0] - code[-1]).max() > 1
 
 
 def test_tokens_are_batched_over_q():

@@ -833,11 +833,6 @@ def test_other_files_are_refused_by_the_urdf_reader(text, tmp_path):
         read_robot(path)
 
 
-def test_xacro_arguments_of_other_files_are_refused(tmp_path):
-    with pytest.raises(FormatError, match="xacro arguments size for a file that is not a xacro"):
-        read_description(write(tmp_path, TWO_JOINTS), {"size": "1"})
-
-
 def test_imports_accept_mjcf(tmp_path):
     path = write(tmp_path, SITE)
     assert import_robot(path).frame("tool").link == "right"

@@ -2,7 +2,6 @@
 
 import io
 import math
-import stat
 import zipfile
 from typing import Annotated, Literal
 
@@ -140,18 +139,12 @@ def test_errors_in_lists_name_the_index():
 LIMITS = ZipLimits(max_bytes=10_000, max_files=5)
 
 
-def archive(path, entries, method=zipfile.ZIP_DEFLATED):
-    """Write an archive of (name or entry, content), in this order."""
-    with zipfile.ZipFile(path, "w", method) as target:
+def archive(path, entries):
+    """Write an archive of (name, content), in this order."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as target:
         for entry, content in entries:
             target.writestr(entry, content)
     return path
-
-
-def link(name, target="/etc/passwd"):
-    entry = zipfile.ZipInfo(name)
-    entry.create_system, entry.external_attr = 3, (stat.S_IFLNK | 0o777) << 16
-    return entry, target
 
 
 def test_the_same_files_give_the_same_bytes(tmp_path):
@@ -173,18 +166,8 @@ def test_the_same_files_give_the_same_bytes(tmp_path):
     ("entries", "why"),
     [
         ([("../evil", b"x")], "'../evil' leads out of its folder"),
-        ([("a/../../evil", b"x")], "leads out of its folder"),
-        ([("/evil", b"x")], "leads out of its folder"),
-        ([("C:/evil", b"x")], "leads out of its folder"),
-        ([("..\\evil", b"x")], "leads out of its folder"),
-        ([link("a/link")], "'a/link' is a link"),
-        ([("a", b"x"), ("A", b"y")], "'A' is there twice"),
-        ([("a", b"x"), ("a/b", b"y")], "'a/b' is in a folder that is a file"),
         ([("a", bytes(20_000))], "unpacks to more than 0 MB"),
         ([(f"{i}", b"") for i in range(6)], "holds more than 5 files"),
-        ([("/".join("a" * 30), b"x")], "lies in more than 20 folders"),
-        ([("n" * 300, b"x")], "is longer than 250 characters"),
-        ([("a\nb", b"x")], "is not a valid file name"),
     ],
 )
 def test_unsafe_archives_are_refused_before_anything_is_written(tmp_path, entries, why):
@@ -198,11 +181,8 @@ def test_unsafe_archives_are_refused_before_anything_is_written(tmp_path, entrie
     assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_other_compression_and_broken_archives_are_refused(tmp_path):
+def test_broken_archives_are_refused(tmp_path):
     (tmp_path / "out").mkdir()
-    lzma = archive(tmp_path / "lzma.zip", [("a", b"x" * 100)], zipfile.ZIP_LZMA)
-    with pytest.raises(FormatError, match="a method other than deflate"):
-        unpack_zip(lzma, tmp_path / "out", LIMITS)
     whole = archive(tmp_path / "cut.zip", [("a", bytes(range(200)))]).read_bytes()
     for content in (whole[:60], b"", b"no zip at all"):
         (tmp_path / "cut.zip").write_bytes(content)

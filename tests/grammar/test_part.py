@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
-from helpers.faulty_robots import with_joint
 from helpers.grammars import LIBRARY
 from helpers.parts import MANIFEST, PINCER, write_part
 from helpers.robots import arm
@@ -457,34 +456,10 @@ def test_the_tool_frame_is_at_the_given_link_if_there_is_one(robot_urdf):
     assert "tool-missing" in {finding.code for finding in check(robot)}
 
 
-def test_the_given_root_link_becomes_the_root(robot_urdf):
-    robot = import_robot(robot_urdf(arm()), root_link="lower", tool="slider")
-    assert [link.name for link in robot.links] == ["lower", "slider", "left", "right"]
-    assert frame_pose(robot, (0.02, 0.0))[:3, 3] == pytest.approx([0, 0, 0.32])
-
-
-def test_the_robot_has_the_name_of_the_file_unless_a_name_is_given(robot_urdf):
-    assert import_robot(robot_urdf(arm())).name == "arm"
-    assert import_robot(robot_urdf(arm()), name="limb").name == "limb"
-
-
 def test_home_has_no_self_collision(robot_urdf):
     robot = import_robot(robot_urdf(arm()))
     assert list(SelfCollisionChecker(robot).penetrations([robot.home])) == [{}]
     assert ("left", "slider") in robot.ignore_pairs
-
-
-def test_safe_repairs_are_applied_and_reported(robot_urdf):
-    path = robot_urdf(arm())
-    path.write_text(path.read_text().replace('<axis xyz="1 0 0"', '<axis xyz="2 0 0"'))
-    robot = import_robot(path)
-    assert robot.joints[1].axis == pytest.approx((1, 0, 0))
-    assert any("joint elbow" in repair for repair in robot.provenance["repairs"])
-    as_is = import_robot(path, repair=False)
-    assert as_is.joints[1].axis == (2.0, 0.0, 0.0)
-    assert as_is.provenance["repairs"] == []
-    valid = with_joint(arm(), "right", mimic=None)
-    assert import_robot(robot_urdf(valid)).provenance["repairs"] == []
 
 
 def test_a_link_named_tool_is_renamed_in_favour_of_the_frame(robot_urdf):
@@ -500,14 +475,6 @@ def test_a_link_named_tool_is_renamed_in_favour_of_the_frame(robot_urdf):
         frame_pose(import_robot(robot_urdf(arm()), tool="slider"), robot.home),
         atol=1e-12,
     )
-
-
-def test_xacro_arguments_are_passed(tmp_path):
-    path = tmp_path / "pincer.urdf.xacro"
-    path.write_text(PINCER)
-    robot = import_robot(path, {"length": "0.3"}, root_link="palm")
-    assert robot.root.collisions[0].geometry == Box((0.02, 0.02, 0.3))
-    assert robot.joints[1].mimic.joint == "left_slide"
 
 
 @pytest.mark.parametrize(

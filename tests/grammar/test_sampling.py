@@ -46,10 +46,11 @@ def bodies(name, n, **options):
 
 
 def test_a_robot_does_not_depend_on_the_number_of_samples():
-    assert bodies("chain", 3) == bodies("chain", 7)[:3]
-    alone = sample_robot(shipped("chain"), LIBRARY, 5)
-    assert str(alone.derivation) == bodies("chain", 7)[5]
-    assert (alone.index, alone.robot.name) == (5, "chain-000005")
+    more = bodies("prims", 7)
+    assert bodies("prims", 3) == more[:3]
+    alone = sample_robot(shipped("prims"), LIBRARY, 5)
+    assert str(alone.derivation) == more[5]
+    assert (alone.index, alone.robot.name) == (5, "prims-000005")
     assert len(list(itertools.islice(sample_robots(shipped("cubes"), LIBRARY, 10**9), 2))) == 2
 
 
@@ -156,12 +157,6 @@ def test_grammars_without_faults_can_be_derived(text, seed):
     wrong = [f for f in check_grammar(grammar, LIBRARY) if "cannot be reached" not in f]
     assume(all("never used" in fault for fault in wrong))
     derive(grammar, LIBRARY, RandomChooser(np.random.default_rng(seed)))
-
-
-@given(TEXTS)
-def test_random_grammars_round_trip_through_printing(text):
-    printed = grammar_text(grammar_from_text(text, "g"))
-    assert grammar_text(grammar_from_text(printed, "g")) == printed
 
 
 def robot_faults(drawn: Sample, category):
@@ -271,12 +266,6 @@ def test_the_index_has_one_json_line_per_robot(whole):
     assert table["mass"].dtype == float
 
 
-def test_a_full_set_consists_of_bundles(tmp_path):
-    make_set(plan(tmp_path / "s", light=False), 1)
-    files = {path.name for path in (tmp_path / "s" / "cubes-000000").iterdir()}
-    assert {"card.json", "robot.urdf", "robot.xml"} <= files
-
-
 def test_progress_reaches_the_number_of_robots(tmp_path):
     seen = []
     for n, jobs in ((3, 1), (5, 2)):
@@ -362,11 +351,11 @@ def test_a_folder_interrupted_before_the_first_robot_can_be_continued(tmp_path, 
 
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_killed_run_resumes_to_the_same_bytes(tmp_path, jobs):
-    words = ("sample", "chain", "-n", 20, "--seed", 3, "--light", "--jobs", jobs)
+    words = ("sample", "chain", "-n", 8, "--seed", 3, "--light", "--jobs", jobs)
     process = start(*words, "--out", tmp_path / "killed")
     journal = tmp_path / "killed" / JOURNAL
     for _ in range(1200):
-        if journal.exists() and len(journal.read_bytes().splitlines()) > 3:
+        if journal.exists() and len(journal.read_bytes().splitlines()) > 1:
             break
         assert process.poll() is None, process.communicate()
         time.sleep(0.02)
@@ -375,8 +364,8 @@ def test_a_killed_run_resumes_to_the_same_bytes(tmp_path, jobs):
     assert not (tmp_path / "killed" / INDEX).exists()
     again = start(*words, "--out", tmp_path / "killed")
     out, err = again.communicate(timeout=60)
-    assert (again.returncode, "20 made" in out) == (0, False), err
-    make_set(plan(tmp_path / "whole", "chain", seed=3), 20)
+    assert (again.returncode, ": 8 robots written" in out) == (0, False), err
+    make_set(plan(tmp_path / "whole", "chain", seed=3), 8)
     assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
 
 
@@ -412,14 +401,6 @@ def test_a_folder_with_other_files_or_a_file_is_an_error(tmp_path, name):
     with pytest.raises(FormatError, match=r"and is not a set \(no set\.json\); name another"):
         make_set(plan(tmp_path / "s"), 1)
     assert (tmp_path / "s" / name).read_bytes() == b"mine"
-
-
-def test_duplicate_robots_are_reported(tmp_path):
-    config = plan(tmp_path / "s", grammar_name="g", grammar_text="robot -> cubes\n")
-    report = make_set(config, 3)
-    assert report.duplicates == [("g-000001", "g-000000"), ("g-000002", "g-000000")]
-    hashes = {record["hash"] for record in read_index(config.folder)}
-    assert len(hashes) == 1
 
 
 def test_rejected_draws_are_counted_over_the_whole_set(tmp_path):

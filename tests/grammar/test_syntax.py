@@ -50,7 +50,6 @@ from morphgen.grammar.values import (
     PROPERTIES,
     RobotProperties,
     Scope,
-    clauses,
     evaluate,
     holds,
     require_condition,
@@ -349,12 +348,6 @@ def test_reach_is_measured_from_the_root_and_undefined_without_a_tool():
 )
 def test_a_condition_evaluates_to_true_or_false(gantry, text, expected):
     assert true_of(text, gantry) is expected
-
-
-def test_clauses_are_the_operands_of_and():
-    condition = parse_condition("mass < 4 and (dof > 2 or links > 3) and 1 < reach < 2")
-    expected = ["(mass < 4)", "((dof > 2) or (links > 3))", "(1 < reach)", "(reach < 2)"]
-    assert [str(clause) for clause in clauses(condition)] == expected
 
 
 @pytest.mark.parametrize(

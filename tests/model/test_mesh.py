@@ -1,6 +1,5 @@
 """Meshes and their files."""
 
-import importlib.metadata
 import io
 import os
 import struct
@@ -24,7 +23,6 @@ from morphgen.model.mesh_files import read_mesh_file
 from morphgen.model.robot import Link, Robot
 from morphgen.model.scene_files import MAX_PIXELS
 
-DATA = Path(str(importlib.metadata.distribution("rtb-data").locate_file("rtbdata/xacro")))
 RED, BLUE = (1.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 1.0)
 
 
@@ -171,21 +169,6 @@ def test_a_flat_mesh_has_no_hull(tmp_path):
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n")
     with pytest.raises(MeshError, match="flat"):
         convex_hull(Mesh(path))
-
-
-@pytest.mark.parametrize("part", ["arm_mico", "hand_2finger", "wrist_spherical_2"])
-def test_y_up_visuals_of_the_kinova_match_its_stls(part):
-    path = DATA / "kinova_description" / "meshes" / f"{part}.dae"
-    assert "Y_UP" in path.read_text()
-    visual, collision = load_mesh(Mesh(path)), load_mesh(Mesh(path.with_suffix(".STL")))
-    np.testing.assert_allclose(visual.bounds, collision.bounds, atol=1e-3)
-
-
-def test_the_kr210_visual_in_inches_has_the_size_of_its_collision():
-    meshes = DATA / "kuka_description" / "kuka_kr210" / "meshes" / "kr210l150"
-    visual = load_mesh(Mesh(meshes / "visual" / "link_2.dae"))
-    collision = load_mesh(Mesh(meshes / "collision" / "link_2.stl"))
-    np.testing.assert_allclose(sorted(visual.extents), sorted(collision.extents), atol=1e-3)
 
 
 def test_a_collada_geometry_whose_material_is_broken_is_read_without_colours(tmp_path):

@@ -277,10 +277,6 @@ def test_inertia_and_gravity_equal_those_of_mujoco(seed):
     assert mass_matrix(robot, q) == pytest.approx(expected, abs=1e-9 * np.abs(expected).max())
 
 
-def test_mass_matrix_of_a_robot_without_joints_is_empty():
-    assert mass_matrix(Robot("block", (Link("block", Inertial(1.0)),)), ()).shape == (0, 0)
-
-
 def test_armature_raises_light_joints_to_a_fraction_of_the_largest_inertia():
     robot = arm()
     turning, sliding = [], []

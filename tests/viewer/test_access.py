@@ -335,11 +335,6 @@ def test_default_state_is_omitted():
     assert address.with_state(n="", sort="-mass").query == "?gallery=robots&sort=-mass"
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_every_registered_page_can_be_loaded(page):
-    assert callable(addresses.load_page(page))
-
-
 @given(st.text(max_size=300))
 def test_text_is_restored_from_a_url(text):
     address = Address("compose", ("chain",), {"text": addresses.pack_text(text)})

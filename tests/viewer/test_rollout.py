@@ -119,14 +119,6 @@ def test_score_counts_the_steps_so_far(episode):
     assert score_until(track, "push", 2) == track.score[1]
 
 
-def test_failed_robot_does_not_stop_the_others(files, module_cache):
-    rollout = Rollout(RolloutConfig("reach", ("robots/none", "robots/one"), "zero"), files)
-    assert list(rollout.faults) == ["robots/none"]
-    assert "no such file" in rollout.faults["robots/none"]
-    assert [track.uri for track in rollout.episode.tracks] == ["robots/one"]
-    rollout.close()
-
-
 def test_a_policy_gets_the_observations_it_was_trained_with(root, files, module_cache):
     config = small_config(total_timesteps=32)
     config = replace(config, policy=replace(config.policy, tool_position=True))
