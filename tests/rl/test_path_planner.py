@@ -351,6 +351,26 @@ def test_a_plan_has_a_free_path_behind_the_block(tmp_path):
     assert np.array_equal(plans[2].path, planner.plan([Push(q, block)])[0].path)
 
 
+def test_a_plan_avoids_overhang(tmp_path, monkeypatch):
+    """A patched overhang penalises configurations near the end of the first plan."""
+    setting = draw_spec(robot(PLANE), PUSH, obstacles=False, seed=0, cache=tmp_path)
+    planner = push_planner_of(setting)
+    q, block = setting.goals.q[0], setting.goals.blocks[0]
+    first = planner.plan([Push(q, block)])[0].path[-1]
+
+    def near(configurations):
+        return np.abs(configurations - first).max(axis=-1) < 1.0
+
+    def said(space, configurations, blocks, edge):
+        assert blocks.shape == (len(configurations), 7)
+        assert (blocks[:, 1] >= block[1]).all()
+        return pushing.MAX_OVERHANG * near(configurations)
+
+    monkeypatch.setattr(pushing, "overhang", said)
+    assert near(first)
+    assert not near(planner.plan([Push(q, block)])[0].path[-1])
+
+
 def test_the_planner_rejects_other_tasks(tmp_path):
     setting = draw_spec(robot(PLANE), FEW_REACH, obstacles=False, seed=0, cache=tmp_path)
     with pytest.raises(ValueError, match="does not push"):
