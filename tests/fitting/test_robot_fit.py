@@ -76,17 +76,6 @@ def test_the_result_does_not_depend_on_the_number_of_processes(tmp_path, wedge):
         assert [row.fit.primitives for row in one] == [row.fit.primitives for row in two]
 
 
-def test_a_flat_link_gets_no_primitive_and_a_finding(tmp_path, wedge):
-    flat = trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], [(0, 1, 2), (0, 2, 3)])
-    robot = arm([mesh_shape(tmp_path, flat, "f.stl")], [mesh_shape(tmp_path, wedge, "w.stl")])
-    report = fit_links(robot, FitOptions())
-    assert [row.link for row in report.links] == ["l1"]
-    (finding,) = report.findings
-    assert (finding.code, finding.where) == ("no-primitive", "link l0")
-    primitive_robot = with_primitives(robot, {row.link: row.fit.primitives for row in report.links})
-    assert primitive_robot.links[0].collisions == ()
-
-
 @pytest.mark.slow
 def test_existing_primitives_are_unchanged():
     shapes = (Shape(Box((0.1, 0.2, 0.3)), Pose((0.0, 0.1, 0.0))), Shape(Sphere(0.1)))

@@ -11,7 +11,7 @@ from scipy.integrate import dblquad
 
 from helpers.commands import run_python
 from helpers.robots import arm
-from morphgen.errors import FitError, FormatError
+from morphgen.errors import FitError
 from morphgen.fitting import search
 from morphgen.fitting.canonical import KINDS
 from morphgen.fitting.link_fit import FitOptions, fit_shapes
@@ -288,19 +288,6 @@ def test_tokens_of_a_robot_with_spheres_are_those_of_its_shapes(made):
     tokens = token_shapes(meshed)
     assert token_shapes(robot) == tokens
     assert token_shapes(as_spheres(robot)) == tokens
-
-
-def test_faults_of_the_cache_are_reported(made, tmp_path, monkeypatch, caplog):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    robot = replace(made[0], links=made[0].links[:1], joints=(), home=())
-    as_spheres(robot, spheres=1)
-    (path,) = tmp_path.rglob("spheres*/*.json")
-    path.write_text("{")
-    with pytest.raises(FormatError, match="delete the file"):
-        as_spheres(robot, spheres=1)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(path))
-    as_spheres(robot, spheres=1)
-    assert f"cannot keep fits in {path}/morphgen/" in caplog.text
 
 
 BLOCK = Shape(Box((0.4, 0.2, 0.1)))

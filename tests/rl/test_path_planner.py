@@ -327,7 +327,8 @@ def push_planner_of(setting):
     return PushPlanner(setting, setting.scene, tables, 0, np.random.default_rng(0))
 
 
-PUSH, FEW_REACH = PushConfig(num_goals=8), ReachConfig(num_goals=4)
+PUSH = PushConfig(num_goals=8, train_layouts=2, eval_layouts=1)
+FEW_REACH = ReachConfig(num_goals=4)
 
 
 def test_a_plan_has_a_free_path_behind_the_block(tmp_path):

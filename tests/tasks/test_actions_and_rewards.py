@@ -416,7 +416,7 @@ def test_a_run_of_an_unknown_task_is_named():
 
 
 WORDS_ONE_ROBOT = "arm=ur5 ee=stick"
-CONFIG = ReachConfig(num_goals=4)
+CONFIG = ReachConfig(num_goals=4, train_layouts=2, eval_layouts=1)
 STEPS = 40
 NAMES = ("words", "bundle", "urdf", "robot", "read", "primitives", "bundle of primitives", "member")
 

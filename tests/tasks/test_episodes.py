@@ -290,7 +290,7 @@ LAYOUTS = {
     "free": ("arm3", MANY_REACH, False),
 }
 """Robot and config of environments, and whether they have obstacles."""
-LONG_REACH = ReachConfig(num_goals=20)
+LONG_REACH = ReachConfig(num_goals=20, train_layouts=2, eval_layouts=1)
 WORDS = ("arm3", "arm=ur5 ee=plane", "prims")
 
 

@@ -32,7 +32,7 @@ SIZE = (160, 120)
 
 @pytest.fixture(scope="module")
 def reach(cache):
-    config = ReachConfig(num_goals=10)
+    config = ReachConfig(num_goals=10, train_layouts=2, eval_layouts=1)
     return draw_spec(load_robot("arm3-stick"), config, obstacles=True, cache=cache)
 
 
