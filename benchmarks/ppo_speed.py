@@ -13,7 +13,7 @@ minibatches. Within a simulator and number of threads all rows share:
   actions.
 - rollout length, environments, epochs, minibatches and minibatch size, and thus gradient steps;
   clip range, discount, GAE lambda, entropy weight, Adam; separate value and policy networks.
-- torch threads, and as many workers of the simulator (PyBullet processes, MuJoCo threads).
+- torch threads, and in MuJoCo as many threads of the simulator; PyBullet has one.
 
 "same network" uses our MLP of ``se`` as features extractor of stable-baselines3, one for the policy
 and one for values, each with a linear layer; the script checks that the number of parameters is
@@ -71,6 +71,7 @@ from morphgen.rl.ppo import Learner
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.observation import Observation, observation_config
+from morphgen.tasks.registry import SIMULATORS
 
 Update = Callable[[], tuple[float, float]]
 """Run one update; return the seconds of collection and of learning."""
@@ -137,7 +138,8 @@ def _shown(row: Row) -> Row:
 def _threads(args: argparse.Namespace, agent: str, sim: str, count: int, loaded: bool) -> Row:
     """Return the speed with the threads of ``morphgen train`` and with the best of others."""
     cores = sorted(os.sched_getaffinity(0))[:count]
-    pairs = [(0, 0), *dict.fromkeys(product((1, count), repeat=2))]
+    workers = (1, count) if SIMULATORS[sim].takes_workers else (1,)
+    pairs = [(0, 0), *dict.fromkeys(product((1, count), workers))]
     speeds: dict[tuple[int, int], float] = {}
     with ExitStack() as stack:
         for core in cores if loaded else ():
@@ -147,8 +149,8 @@ def _threads(args: argparse.Namespace, agent: str, sim: str, count: int, loaded:
             )
             stack.callback(busy.wait)
             stack.callback(busy.kill)
-        for torch_threads, workers in pairs:
-            words = map(str, ("--one", agent, sim, torch_threads, workers, "--robot", args.robot))
+        for pair in pairs:
+            words = map(str, ("--one", agent, sim, *pair, "--robot", args.robot))
             sizes = map(str, ("--envs", args.envs, "--rounds", args.rounds))
             done = subprocess.run(
                 [sys.executable, __file__, *words, *sizes],
@@ -157,7 +159,7 @@ def _threads(args: argparse.Namespace, agent: str, sim: str, count: int, loaded:
                 text=True,
                 stdout=subprocess.PIPE,
             )
-            speeds[torch_threads, workers] = float(done.stdout)
+            speeds[pair] = float(done.stdout)
     default = speeds.pop((0, 0))
     best = max(speeds, key=speeds.__getitem__)
     return {
@@ -209,11 +211,12 @@ def _beside(robot: str, sim: Any, envs: int, threads: int, rounds: int) -> Itera
     from morphgen.tasks.scenes.make import make_batch
 
     body = load_robot(robot)
+    workers = threads if SIMULATORS[sim].takes_workers else 1
     torch.set_num_threads(threads)
     with ExitStack() as stack:
 
         def batch() -> TaskBatch:
-            made = make_batch("reach", [body], envs, sim=sim, workers=threads)
+            made = make_batch("reach", [body], envs, sim=sim, workers=workers)
             stack.callback(made.close)
             return made
 

@@ -44,7 +44,7 @@ EE_TASK_STUDIES = {
     "ee-task-20m": "",
     "ee-task-contact": ", channels `contact` and `pace`",
 }
-"""What the policies of a study see besides their agent's channels."""
+"""Studies of ``EE_TASK``, and what their policies see besides the channels of their agent."""
 SHIPPED_PUSH = "zero-shot-push"  # it has trained on other robots than those of the split
 SPLITS = (
     "interpolation/arm3",

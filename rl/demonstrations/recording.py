@@ -483,6 +483,7 @@ def at_joints(batch: TaskBatch, action: torch.Tensor) -> torch.Tensor:
     return torch.gather(action, 1, link)
 
 
+_COMPARED = ("observation.state", "observation.object_pose", "next.reward")
 TOLERANCE = 1e-3
 """Largest deviation of a joint or of the object [rad or m]: another processor rounds differently,
 and a contact makes a difference grow."""
@@ -552,6 +553,3 @@ def _replay(demos: Demonstrations, episode: RecordedEpisode) -> Replay:
     faults = certify_goal_set(spec.goals, spec)
     joints, thing, reward = errors.tolist()
     return Replay(episode, spec.robot.name, joints, thing, reward, success, faults)
-
-
-_COMPARED = ("observation.state", "observation.object_pose", "next.reward")

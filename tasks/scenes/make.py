@@ -197,7 +197,7 @@ def batch_from_specs(
     require_simulator_device(simulator.name, device)
     if workers > 1 and not simulator.takes_workers:
         raise TaskError(
-            f"simulator {simulator.name!r} steps all environments at once: {workers} workers; "
+            f"simulator {simulator.name!r} shares its work with no others: {workers} workers; "
             "expected 1"
         )
     _require_contacts(simulator, specs)

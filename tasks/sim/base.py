@@ -335,7 +335,7 @@ class Simulator:
     simulates_contacts: bool = True
     """Whether the simulator has contacts; one without takes no scenes with a block or obstacles."""
     takes_workers: bool = True
-    """Whether processes or threads share its work; one without steps all environments at once."""
+    """Whether threads share its work; PyBullet has none, and others step all at once."""
     worker_envs: int = 0
     """Environments for which another worker is worth its cost: by default there are as many workers
     as these allow and cores can be used; 0 for one."""

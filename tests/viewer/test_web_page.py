@@ -349,7 +349,7 @@ def test_commands_of_a_page_are_valid(shared_viewer, folder, query, expected):
 
 def test_every_command_in_the_viewers_texts_exists():
     known = build_parser()._subparsers._group_actions[0].choices
-    for path in Path(morphgen.viewer.__file__).parent.glob("*.py"):
+    for path in Path(morphgen.viewer.__file__).parent.rglob("*.py"):
         for verb in re.findall(r"[`\"'( ]morphgen ([a-z]+)", path.read_text(encoding="utf-8")):
             assert verb in {*known, *PROSE}, f"{path.name}: morphgen {verb}"
 
