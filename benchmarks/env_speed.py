@@ -63,7 +63,7 @@ from morphgen.processes import one_torch_thread
 from morphgen.splits.split_file import read_split
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.configs import ReachConfig
 from morphgen.tasks.scenes.make import make_batch, make_split_batch
 from morphgen.tasks.sim import bullet_scene
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts

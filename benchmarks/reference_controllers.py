@@ -41,9 +41,8 @@ from morphgen.rl.inference import run_episodes
 from morphgen.splits.split import SIDES, Member
 from morphgen.splits.split_file import read_split, split_names
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.reach import GOAL_KINDS
-from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.registry import TASKS, installed_simulators
+from morphgen.tasks.configs import ReachConfig
+from morphgen.tasks.registry import GOAL_KINDS, TASKS, installed_simulators
 from morphgen.tasks.scenes.env_specs import GoalConfig, member_spec
 from morphgen.tasks.scenes.make import batch_from_specs
 

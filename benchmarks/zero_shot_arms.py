@@ -55,7 +55,7 @@ from morphgen.rl.shipped_policies import checkpoint_path, name_of, zero_shot_pol
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.kinematic_channels import IK_SHARE
 from morphgen.tasks.observation import observation_config
-from morphgen.tasks.reach import GOAL_KINDS
+from morphgen.tasks.registry import GOAL_KINDS
 from morphgen.tasks.scenes.env_specs import GoalConfig
 
 LEFT_OUT = ("arm3", "arm5", "arm_ed", "panda_scaled", "yumi")

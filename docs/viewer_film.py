@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image
 from viewer_pictures import WAIT, hide_notice, served
 
-from morphgen.tasks.render.renderer import Frame, write_video
+from morphgen.tasks.renderer import Frame, write_video
 from viewer_speed import started_browser
 
 SIZE = (1280, 800)

@@ -18,7 +18,7 @@ import numpy as np
 
 from morphgen.rl.inference import FPS, make_env_and_controller, play, read_controller
 from morphgen.rl.shipped_policies import zero_shot_policy
-from morphgen.tasks.render.renderer import write_video
+from morphgen.tasks.renderer import write_video
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 from robot_curve import REAL_ARMS

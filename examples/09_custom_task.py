@@ -14,8 +14,8 @@ import torch
 
 from morphgen.cli import main
 from morphgen.tasks import task as interface
+from morphgen.tasks.configs import ReachConfig
 from morphgen.tasks.random_numbers import Stream
-from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.task import REACH, ReachGoalSet
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.rows import GoalChoices, choose, namespace_of, padded_rows, row_norms

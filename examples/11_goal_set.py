@@ -11,8 +11,8 @@ import numpy as np
 
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
+from morphgen.tasks.configs import ReachConfig
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.task import Reach, ReachGoalSet
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import env_spec, load_robot

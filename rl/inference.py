@@ -40,7 +40,7 @@ from morphgen.tasks.task import TaskConfig
 
 if TYPE_CHECKING:
     from morphgen.tasks.gym.env import TaskEnv
-    from morphgen.tasks.render.renderer import Frame
+    from morphgen.tasks.renderer import Frame
 
 Mode = Literal["deterministic", "stochastic"]
 MODES: tuple[Mode, ...] = ("deterministic", "stochastic")

@@ -1,6 +1,6 @@
 """Tasks and simulators by name: morphgen's own, and those of other packages.
 
-It also has the names of the observation channels, for it loads neither torch nor NumPy.
+It also has the names of observation channels and goals, for it loads neither torch nor NumPy.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ CHANNELS = (
 )
 """Channels of observations that can be asked for by name; ``no_state`` hides what it names, and
 ``pace`` changes others."""
+GOAL_KINDS = ("position", "pose")
+"""Kinds of goals of reach: the tool's position, or its position and orientation."""
 
 
 class Named(Protocol):

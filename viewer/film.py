@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from morphgen.model.robot import Robot
-from morphgen.tasks.render.renderer import SIZE, Frame, Renderer, RenderState, write_video
+from morphgen.tasks.renderer import SIZE, Frame, Renderer, RenderState, write_video
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.typing import Array
 from morphgen.viewer.episode import BLOCK, STRIDE, Episode, Track

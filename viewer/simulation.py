@@ -33,7 +33,7 @@ from morphgen.rl.shipped_policies import is_named, policies_for
 from morphgen.tasks.batch import BeforePhysics, TaskBatch
 from morphgen.tasks.gym.env import TaskEnv
 from morphgen.tasks.registry import TASKS
-from morphgen.tasks.render.renderer import RenderState, render_state
+from morphgen.tasks.renderer import RenderState, render_state
 from morphgen.tasks.scenes.env_specs import load_robot
 from morphgen.tasks.sim.articulated import ArticulatedObject
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Block

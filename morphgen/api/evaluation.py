@@ -56,7 +56,7 @@ from morphgen.rl.shipped_policies import checkpoint_path, is_named
 from morphgen.splits.split import Side, require_side
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, require_device
-from morphgen.tasks.render.renderer import require_video_path, write_video
+from morphgen.tasks.renderer import require_video_path, write_video
 from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
 from morphgen.tasks.task import TaskConfig
 

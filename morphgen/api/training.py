@@ -39,8 +39,8 @@ from morphgen.rl.runs.training import train as train_parts
 from morphgen.rl.shipped_policies import checkpoint_path
 from morphgen.splits.split import Side, require_side
 from morphgen.splits.split_file import read_split
+from morphgen.tasks.configs import ReachConfig
 from morphgen.tasks.goals.split_goals import has_goals, read_split_goals
-from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import (
     DEFAULT_SIMULATOR,
     SIMULATORS,

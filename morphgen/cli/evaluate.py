@@ -19,9 +19,8 @@ from morphgen.rl.runs.robot_source import robot_source
 from morphgen.rl.scores import Score, require_table, success_of
 from morphgen.rl.shipped_policies import checkpoint_path, zero_shot_policy
 from morphgen.tables import table
-from morphgen.tasks.reach import GOAL_KINDS
-from morphgen.tasks.registry import DEFAULT_SIMULATOR, TASKS
-from morphgen.tasks.render.renderer import require_video_path
+from morphgen.tasks.registry import DEFAULT_SIMULATOR, GOAL_KINDS, TASKS
+from morphgen.tasks.renderer import require_video_path
 from morphgen.tasks.sim.base import CONTROL_PERIOD
 
 

@@ -11,8 +11,8 @@ import torch
 from morphgen.model.kinematics_torch import frame_jacobian, pose_task
 from morphgen.tasks.actions import BINS, encode_actions
 from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.configs import ReachConfig
 from morphgen.tasks.observation import LinkJoints
-from morphgen.tasks.reach.config import ReachConfig
 
 
 class Zero:

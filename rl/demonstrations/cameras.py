@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from morphgen.errors import TaskError, nearest
 from morphgen.rl.demonstrations.lerobot import FPS, Arrays, moments
-from morphgen.tasks.render.renderer import (
+from morphgen.tasks.renderer import (
     FRONT_FOV,
     WRIST,
     WRIST_FOV,

@@ -68,7 +68,7 @@ from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.goals.goal_sets import set_npz
 from morphgen.tasks.goals.split_goals import certify_goal_set, read_goals, shipped_goal_set
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
-from morphgen.tasks.render.renderer import Camera
+from morphgen.tasks.renderer import Camera
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot
 from morphgen.tasks.scenes.make import batch_from_specs
 from morphgen.tasks.task import EnvSpec

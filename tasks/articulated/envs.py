@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from morphgen.model.geometry import Pose
 from morphgen.model.inertia import bounding_box
-from morphgen.tasks.articulated.config import ArticulatedConfig
 from morphgen.tasks.articulated.starts import ArticulatedStartSet
+from morphgen.tasks.configs import ArticulatedConfig
 from morphgen.tasks.observation import box_tokens
 from morphgen.tasks.push.envs import GAP, curriculum_part, push_terms
 from morphgen.tasks.random_numbers import EpisodeRandom, Stream

@@ -24,7 +24,7 @@ from morphgen.grammar.manifest import Manifest
 from morphgen.model.geometry import Mesh, Pose
 from morphgen.model.kinematics import joint_limits, solve_position_ik
 from morphgen.model.robot import TOOL, Robot
-from morphgen.tasks.articulated.config import ArticulatedConfig
+from morphgen.tasks.configs import ArticulatedConfig
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.push.starts import BEHIND, draw_starts, sample_tools_in_box, work_region
 from morphgen.tasks.scenes.obstacles import no_obstacles

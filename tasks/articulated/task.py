@@ -13,18 +13,18 @@ from morphgen.errors import MorphgenError, TaskError
 from morphgen.grammar.catalogue import source_digest
 from morphgen.model.inertia import bounding_box, box_corners
 from morphgen.model.robot import Robot
-from morphgen.tasks.articulated.config import (
-    ArticulatedConfig,
-    DialConfig,
-    DoorConfig,
-    DrawerConfig,
-)
 from morphgen.tasks.articulated.starts import (
     POINTS,
     ArticulatedStartSet,
     object_manifest,
     sample_starts,
     start_faults,
+)
+from morphgen.tasks.configs import (
+    ArticulatedConfig,
+    DialConfig,
+    DoorConfig,
+    DrawerConfig,
 )
 from morphgen.tasks.free_space import FreeSpace, outside_limits
 from morphgen.tasks.sim.base import Scene

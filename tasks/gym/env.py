@@ -36,7 +36,7 @@ from morphgen.tasks.gym.vector import (
 )
 from morphgen.tasks.observation import LinkJoints, LinkTokens, Observation
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
-from morphgen.tasks.render.renderer import SIZE, Frame
+from morphgen.tasks.renderer import SIZE, Frame
 from morphgen.tasks.rows import numpy_row
 from morphgen.tasks.scenes.env_specs import GoalConfig
 from morphgen.tasks.scenes.make import make_batch

@@ -23,7 +23,7 @@ from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.observation import Observation, ObservationConfig
 from morphgen.tasks.registry import KINEMATIC_CHANNELS, TASKS, register_gym_envs
-from morphgen.tasks.render.renderer import SIZE, Frame, Renderer, RenderState, render_state
+from morphgen.tasks.renderer import SIZE, Frame, Renderer, RenderState, render_state
 from morphgen.tasks.scenes.env_specs import task_configs
 from morphgen.tasks.scenes.make import BatchOptions, make_batch
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from morphgen.tasks.configs import PushConfig
 from morphgen.tasks.observation import box_tokens
-from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.starts import PushStartSet
 from morphgen.tasks.random_numbers import EpisodeRandom, Stream
 from morphgen.tasks.rows import (

@@ -22,8 +22,8 @@ from morphgen.model.kinematics import (
     solve_position_ik,
 )
 from morphgen.model.robot import TOOL, Robot
+from morphgen.tasks.configs import PushConfig
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.sim.base import Block
 from morphgen.tasks.task import GoalSet
 from morphgen.typing import Array

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from morphgen.model.geometry import Pose
 from morphgen.model.inertia import box_corners
 from morphgen.model.robot import Robot
+from morphgen.tasks.configs import PushConfig
 from morphgen.tasks.free_space import FreeSpace, outside_limits
-from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.starts import (
     FeasibilityTest,
     PushStartSet,

@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.model.kinematics_torch import angle_between, matrix_from_quaternion
+from morphgen.tasks.configs import ReachConfig
 from morphgen.tasks.random_numbers import EpisodeRandom, Stream
-from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.rows import GoalChoices, choose, padded_rows, row_norms
 from morphgen.tasks.task import A, EnvSpec, StepFormulas, StepResult, TaskEnvs, TaskState
 

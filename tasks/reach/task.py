@@ -18,13 +18,13 @@ from morphgen.formats.mjcf.write import MujocoKinematics
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import TOOL, Robot
+from morphgen.tasks.configs import ReachConfig
 from morphgen.tasks.free_space import (
     FreeSpace,
     cspace_components,
     in_other_component,
     outside_limits,
 )
-from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.obstacles import layout_faults, no_obstacles, with_obstacles
 from morphgen.tasks.sim.base import Block, Scene
 from morphgen.tasks.task import GOAL, EnvSpec, GoalSet, Marker, Task

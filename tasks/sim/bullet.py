@@ -17,7 +17,7 @@ from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Robot
-from morphgen.tasks.sim.articulated import ArticulatedObject
+from morphgen.tasks.sim.articulated import ArticulatedObject, merge_rigid_links
 from morphgen.tasks.sim.base import (
     CONTROL_PERIOD,
     SUBSTEPS,
@@ -26,6 +26,9 @@ from morphgen.tasks.sim.base import (
     HostSimulation,
     Scene,
     Simulator,
+    clamp,
+    constant,
+    is_within,
 )
 from morphgen.tasks.sim.bullet_scene import (
     FROM_BULLET,
@@ -35,8 +38,6 @@ from morphgen.tasks.sim.bullet_scene import (
     MotorForces,
     limited_speeds,
 )
-from morphgen.tasks.sim.motor_law import clamp, constant, is_within
-from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
 from morphgen.typing import Array
 
 MAX_VELOCITY = 1e4

@@ -16,10 +16,19 @@ from morphgen.model.dynamics import BANDWIDTH, actuation, movable_mass_matrix
 from morphgen.model.geometry import Pose
 from morphgen.model.robot import Robot
 from morphgen.model.tree import rigid_groups
-from morphgen.tasks.sim.articulated import ArticulatedObject
-from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
-from morphgen.tasks.sim.motor_law import GAIN, clamp, constant, farthest_targets
-from morphgen.tasks.sim.rigid_bodies import ground_contact_links
+from morphgen.tasks.sim.articulated import ArticulatedObject, ground_contact_links
+from morphgen.tasks.sim.base import (
+    GAIN,
+    GRAVITY,
+    SUBSTEPS,
+    TIMESTEP,
+    Block,
+    Contacts,
+    Scene,
+    clamp,
+    constant,
+    farthest_targets,
+)
 from morphgen.typing import Array
 
 try:

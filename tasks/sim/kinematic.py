@@ -9,8 +9,15 @@ import torch
 
 from morphgen.errors import SimulationError
 from morphgen.model.robot import Robot
-from morphgen.tasks.sim.base import Contacts, Scene, Simulation, Simulator, is_host
-from morphgen.tasks.sim.motor_law import CONTROL_STEP, farthest_targets
+from morphgen.tasks.sim.base import (
+    CONTROL_STEP,
+    Contacts,
+    Scene,
+    Simulation,
+    Simulator,
+    farthest_targets,
+    is_host,
+)
 from morphgen.typing import Array
 
 UNLIMITED = (-np.inf, np.inf)  # position limits of joints without any [rad or m]

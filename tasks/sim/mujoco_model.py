@@ -14,10 +14,12 @@ from morphgen.formats.mjcf.write import to_spec
 from morphgen.model.dynamics import armature, movable_mass_matrix
 from morphgen.model.geometry import IDENTITY, Box, Capsule, Cylinder, Mesh, Shape, Sphere
 from morphgen.model.robot import Robot
-from morphgen.tasks.sim.articulated import ArticulatedObject
-from morphgen.tasks.sim.base import GRAVITY, TIMESTEP, Block, Contacts, Scene
-from morphgen.tasks.sim.motor_law import GAIN
-from morphgen.tasks.sim.rigid_bodies import ground_contact_links, merge_rigid_links
+from morphgen.tasks.sim.articulated import (
+    ArticulatedObject,
+    ground_contact_links,
+    merge_rigid_links,
+)
+from morphgen.tasks.sim.base import GAIN, GRAVITY, TIMESTEP, Block, Contacts, Scene
 from morphgen.typing import Array
 
 Indices = NDArray[np.int64]

@@ -17,15 +17,13 @@ from morphgen.model.kinematics import movable_positions
 from morphgen.tasks.sim.articulated import ObjectJoints
 from morphgen.tasks.sim.base import (
     CONTROL_PERIOD,
+    CONTROL_STEP,
+    GAIN,
     SUBSTEPS,
     Contacts,
     HostSimulation,
     Scene,
     Simulator,
-)
-from morphgen.tasks.sim.motor_law import (
-    CONTROL_STEP,
-    GAIN,
     clamp,
     constant,
     farthest_targets,

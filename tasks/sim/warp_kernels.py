@@ -5,7 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from morphgen.model.dynamics import BANDWIDTH
-from morphgen.tasks.sim.motor_law import GAIN
+from morphgen.tasks.sim.base import GAIN
 from morphgen.tasks.sim.mujoco_model import PASSIVE
 from morphgen.tasks.sim.mujoco_sim import BY_ERROR, BY_VELOCITY, MAX_SPEED
 

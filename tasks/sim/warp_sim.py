@@ -32,8 +32,14 @@ except ModuleNotFoundError as error:
 
 from morphgen.tasks.sim import warp_kernels as kernels
 from morphgen.tasks.sim.articulated import ObjectJoints
-from morphgen.tasks.sim.base import SUBSTEPS, Contacts, Scene, Simulation, Simulator
-from morphgen.tasks.sim.motor_law import farthest_targets
+from morphgen.tasks.sim.base import (
+    SUBSTEPS,
+    Contacts,
+    Scene,
+    Simulation,
+    Simulator,
+    farthest_targets,
+)
 from morphgen.tasks.sim.mujoco_model import World, worlds
 
 ITERATIONS = 12

@@ -23,6 +23,7 @@ from morphgen.grammar.library import default_library
 from morphgen.progress import show_progress
 from morphgen.splits.split_file import read_split, split_names
 from morphgen.tasks import free_space
+from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.goals import goal_sets as packaged_sets
 from morphgen.tasks.goals.goal_sets import (
     FOLDER,
@@ -41,9 +42,7 @@ from morphgen.tasks.goals.split_goals import (
     sample_robot_goals,
 )
 from morphgen.tasks.goals.split_goals import sample_split_goals as make
-from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.reach import task as reach_goals
-from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import (
     GoalConfig,

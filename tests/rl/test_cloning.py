@@ -13,8 +13,7 @@ from morphgen.rl.demonstrations.cloning import recorded_source, returns_of
 from morphgen.rl.demonstrations.recording import record_states
 from morphgen.rl.inference import load_policy
 from morphgen.rl.runs.checkpoint import read_checkpoint
-from morphgen.tasks.articulated.config import DrawerConfig
-from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.configs import DrawerConfig, ReachConfig
 from morphgen.tasks.scenes.make import make_batch
 
 pytest.importorskip("pyarrow")

@@ -26,7 +26,7 @@ from morphgen.rl.demonstrations.recording import RecordingConfig, record, replay
 from morphgen.rl.inference import run_episodes
 from morphgen.rl.runs.robot_source import drawn_source, robot_source
 from morphgen.tasks.observation import ObservationConfig
-from morphgen.tasks.render.renderer import FRONT_FOV, WRIST, Renderer, RenderState
+from morphgen.tasks.renderer import FRONT_FOV, WRIST, Renderer, RenderState
 from morphgen.tasks.scenes.make import batch_from_specs
 from morphgen.tasks.scenes.robot_tables import build_robot_tables
 

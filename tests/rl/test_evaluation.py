@@ -17,7 +17,7 @@ from morphgen.rl.runs.checkpoint import read_checkpoint, write_checkpoint
 from morphgen.rl.runs.robot_source import other_side, robot_source, split_source
 from morphgen.rl.runs.training import checkpoint_files, subruns_of, train
 from morphgen.rl.scores import Evaluation, scores_to_json
-from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.configs import ReachConfig
 from morphgen.tasks.registry import SIMULATORS
 from morphgen.tasks.scenes.make import batch_from_specs
 

@@ -28,9 +28,8 @@ from morphgen.rl.baselines.simple import GAIN, JacobianColumns, column_steps
 from morphgen.rl.inference import run_episodes
 from morphgen.splits.split_file import read_split
 from morphgen.tasks.actions import encode_actions
+from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.free_space import RESOLUTION, FreeSpace
-from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import SIMULATORS, TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig, member_spec
 from morphgen.tasks.scenes.make import batch_from_specs, make_batch

@@ -32,8 +32,8 @@ from morphgen.rl.runs.checkpoint import read_checkpoint, require_learner
 from morphgen.rl.runs.training import resume_learner, state_of, train
 from morphgen.rl.shipped_policies import POLICIES
 from morphgen.tasks.actions import BINS
+from morphgen.tasks.configs import ReachConfig
 from morphgen.tasks.observation import observation_config
-from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.task import Reach
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.make import make_batch

@@ -24,8 +24,8 @@ from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.inference import make_env_and_controller, play, read_controller, run_episodes
 from morphgen.rl.ppo import Learner, gae, matching_loss, symexp, symlog
 from morphgen.rl.scores import stratified_mean_interval, success_interval
+from morphgen.tasks.configs import ReachConfig
 from morphgen.tasks.observation import ObservationConfig
-from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.scenes.make import batch_from_specs, make_batch
 from morphgen.tasks.sim import base
 

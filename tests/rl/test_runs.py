@@ -21,8 +21,7 @@ from morphgen.rl.runs.checkpoint import CHECKPOINT, CONFIG, config_from, open_ru
 from morphgen.rl.runs.robot_source import drawn_source, other_side, robot_source, source_from
 from morphgen.rl.runs.training import METRICS, ROBOTS, read_metrics, recording
 from morphgen.rl.scores import Evaluation, scores_to_json
-from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.configs import PushConfig, ReachConfig
 
 
 def report(update, success=0.5):

@@ -36,8 +36,7 @@ from morphgen.rl.runs.robot_source import draw, drawn_source, robot_source, spec
 from morphgen.rl.runs.training import ExecutionConfig, TrainingBatches, read_metrics, train
 from morphgen.splits.split import Member, compose_member
 from morphgen.splits.split_file import read_split, split_names, write_split
-from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig, load_robot
 from morphgen.tasks.scenes.robot_tables import build_robot_tables

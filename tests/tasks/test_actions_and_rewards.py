@@ -34,11 +34,10 @@ from morphgen.model.robot import Frame, Link, Robot
 from morphgen.rl.config import PPOConfig
 from morphgen.rl.runs.checkpoint import config_from
 from morphgen.tasks.actions import ActionDecoder, JointMotion
+from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.gym.vector import TaskVector
 from morphgen.tasks.observation import LinkTokens
-from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.envs import PushFormulas, curriculum_line, push_terms
-from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.envs import ReachEnvs, ReachFormulas, anybody_score, is_near, reach_terms
 from morphgen.tasks.reach.task import Reach
 from morphgen.tasks.registry import TASKS

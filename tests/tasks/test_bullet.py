@@ -16,9 +16,8 @@ from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene
 from morphgen.errors import SimulationError
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import forward_kinematics, joint_limits
-from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
-from morphgen.tasks.sim.motor_law import LAG
-from morphgen.tasks.sim.rigid_bodies import merge_rigid_links
+from morphgen.tasks.sim.articulated import merge_rigid_links
+from morphgen.tasks.sim.base import GRAVITY, LAG, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
 
 pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 import pybullet

@@ -15,14 +15,12 @@ from morphgen.errors import NoGoalsError, PartError, SimulationError, TaskError
 from morphgen.model.geometry import Box, Mesh, Pose, Shape
 from morphgen.model.kinematics import joint_limits
 from morphgen.model.robot import TOOL, Frame
-from morphgen.tasks.articulated.config import DialConfig, DoorConfig, DrawerConfig
 from morphgen.tasks.articulated.envs import GAP, ArticulatedFormulas, object_tables
 from morphgen.tasks.articulated.starts import PathFinder
+from morphgen.tasks.configs import DialConfig, DoorConfig, DrawerConfig, PushConfig, ReachConfig
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.goals.goal_sets import set_from_npz, set_npz
 from morphgen.tasks.observation import NOISE, ObservationConfig
-from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.registry import SIMULATORS, TASKS
 from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.sim.articulated import ArticulatedObject, ObjectJoints

@@ -17,12 +17,11 @@ from morphgen.rl.baselines.simple import Random, Zero
 from morphgen.rl.inference import STEPS_UNREAD, run_episodes
 from morphgen.tasks.actions import BINS, encode_actions
 from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.observation import NOISE, ObservationConfig, observation_config
-from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.random_numbers import EpisodeRandom, EpisodeSequence, Stream, philox
-from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.render.renderer import render_state
+from morphgen.tasks.renderer import render_state
 from morphgen.tasks.scenes.make import batch_from_specs, make_batch
 from morphgen.tasks.scenes.robot_tables import build_robot_tables
 from morphgen.tasks.sim import base

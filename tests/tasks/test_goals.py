@@ -24,14 +24,13 @@ from morphgen.model.kinematics import (
 from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.model.tree import rename
 from morphgen.tasks import free_space as of_free_space
+from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.free_space import SAME, FreeSpace, cspace_components, in_other_component
 from morphgen.tasks.goals import goal_sets
 from morphgen.tasks.goals.goal_sets import set_npz
 from morphgen.tasks.push import starts
-from morphgen.tasks.push.config import PushConfig
 from morphgen.tasks.push.starts import push_region
 from morphgen.tasks.reach import task as module
-from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.task import REACH
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes import obstacles
@@ -44,8 +43,8 @@ from morphgen.tasks.scenes.obstacles import (
     layouts_of,
     place_boxes,
 )
+from morphgen.tasks.sim.articulated import ground_contact_links
 from morphgen.tasks.sim.base import Block, Scene
-from morphgen.tasks.sim.rigid_bodies import ground_contact_links
 
 WORDS = (
     "arm=ur5 ee=plane",

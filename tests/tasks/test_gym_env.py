@@ -26,12 +26,11 @@ from morphgen.errors import CompositionError, MorphgenError, TaskError
 from morphgen.progress import show_progress
 from morphgen.tasks import make_batch
 from morphgen.tasks.actions import BINS
+from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.gym.env import TaskEnv
 from morphgen.tasks.gym.sb3 import SB3Vector
 from morphgen.tasks.gym.vector import TaskVector, observation_space, task_vector
 from morphgen.tasks.observation import ObservationConfig, observation_config
-from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.sim.base import Contacts
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 from morphgen.tasks.task import BOUND, ObservationField

@@ -19,6 +19,7 @@ from morphgen.rl.config import PolicyConfig
 from morphgen.rl.inference import run_episodes
 from morphgen.rl.observation_layout import layout_of
 from morphgen.rl.policies import make_networks
+from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.kinematic_channels import (
     CLEARANCES,
     COLUMN_SCALE,
@@ -32,8 +33,6 @@ from morphgen.tasks.kinematic_channels import (
     compile_capsules,
 )
 from morphgen.tasks.observation import MAX_TREE_DISTANCE, NUM_POINTS, observation_config
-from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.envs import ReachEnvs
 from morphgen.tasks.registry import CHANNELS, KINEMATIC_CHANNELS
 from morphgen.tasks.scenes.make import batch_from_specs

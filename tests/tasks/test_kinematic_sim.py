@@ -16,8 +16,7 @@ from helpers.scenes import PAPER_ROBOTS, reach_scene, robot
 from morphgen.errors import SimulationError, TaskError
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.kinematics import forward_kinematics, frame_pose, joint_limits
-from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.reach.config import ReachConfig
+from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.registry import (
     SIMULATORS,
     batch_device,
@@ -25,9 +24,8 @@ from morphgen.tasks.registry import (
     installed_simulators,
 )
 from morphgen.tasks.scenes.make import batch_from_specs, make_batch
-from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts, Scene
+from morphgen.tasks.sim.base import CONTROL_PERIOD, LAG, Contacts, Scene, speed_limit
 from morphgen.tasks.sim.kinematic import NO_CONTACTS, KinematicSimulation
-from morphgen.tasks.sim.motor_law import LAG, speed_limit
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 
 REVOLUTE, FINGERS = "arm=ur5 ee=plane", "arm=panda ee=panda_hand"

@@ -10,10 +10,9 @@ import torch
 from helpers.simulators import needs_pybullet
 from morphgen.tasks import make_batch
 from morphgen.tasks.actions import BINS
+from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.gym.env import TaskEnv, steps_in_numpy
 from morphgen.tasks.observation import ObservationConfig
-from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.reach.config import ReachConfig
 from morphgen.tasks.reach.envs import ReachEnvs
 from morphgen.tasks.registry import TASKS
 

@@ -12,10 +12,9 @@ from helpers.objects import door
 from helpers.robots import arm
 from morphgen.errors import FormatError
 from morphgen.model.geometry import Pose
-from morphgen.tasks.push.config import PushConfig
-from morphgen.tasks.reach.config import ReachConfig
-from morphgen.tasks.render import renderer
-from morphgen.tasks.render.renderer import (
+from morphgen.tasks import renderer
+from morphgen.tasks.configs import PushConfig, ReachConfig
+from morphgen.tasks.renderer import (
     Renderer,
     RenderState,
     render_state,

@@ -41,8 +41,10 @@ from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.registry import SIMULATORS
 from morphgen.tasks.scenes.env_specs import load_robot
 from morphgen.tasks.sim import mujoco_model
+from morphgen.tasks.sim.articulated import ground_contact_links, merge_rigid_links
 from morphgen.tasks.sim.base import (
     CONTROL_PERIOD,
+    GAIN,
     GRAVITY,
     SUBSTEPS,
     TIMESTEP,
@@ -50,9 +52,7 @@ from morphgen.tasks.sim.base import (
     Contacts,
     Scene,
 )
-from morphgen.tasks.sim.motor_law import GAIN
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
-from morphgen.tasks.sim.rigid_bodies import ground_contact_links, merge_rigid_links
 
 ALL, WITH_CONTACTS = ("kinematic", "mujoco", PYBULLET), ("mujoco", PYBULLET)
 NOTHING_TOUCHES = Contacts(False, False)

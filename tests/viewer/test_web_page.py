@@ -32,7 +32,7 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_request
 from morphgen.model.kinematics import joint_limits
-from morphgen.tasks.render.renderer import Renderer, RenderState
+from morphgen.tasks.renderer import Renderer, RenderState
 from morphgen.tasks.sim.base import Scene
 from morphgen.viewer import film
 from morphgen.viewer.app.address import MAX_CHOSEN, Address, parse_address
