@@ -17,7 +17,13 @@ from msgspec import NODEFAULT
 
 from morphgen.errors import TaskError, nearest
 from morphgen.formats.records import Record, dotted_values, read_record
-from morphgen.rl.agents import AGENTS, NetworkConfig, network_fields, require_numbers
+from morphgen.rl.agents import (
+    AGENTS,
+    NetworkConfig,
+    network_fields,
+    preset_of,
+    require_numbers,
+)
 from morphgen.splits.split import Side
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.observation import observation_config
@@ -324,6 +330,23 @@ def configs_of(
     )
     ppo = PPOConfig(total_timesteps=total_timesteps)
     return replace(policy, **values_for(PolicyConfig)), replace(ppo, **values_for(PPOConfig))
+
+
+def spec_of(policy: PolicyConfig, ppo: PPOConfig, tasks: Sequence[str]) -> AgentSpec:
+    """Return the agent of a run with the switches that its default preset has otherwise."""
+    preset = AgentSpec(policy.agent, preset_of(None, policy.agent).switches)
+    runs = ((policy, ppo), configs_of(preset, tasks, {}, ppo.total_timesteps))
+    own, default = ({**vars(ppo), **vars(policy)} for policy, ppo in runs)
+    switches = {}
+    for name in SWITCHES:
+        field_name = _FIELDS.get(name) or name.replace("-", "_")
+        is_on, by_default = (
+            field_name in values["observe"] if field_name in CHANNELS else values[field_name]
+            for values in (own, default)
+        )
+        if is_on != by_default:
+            switches[name] = bool(is_on)
+    return AgentSpec(policy.agent, switches)
 
 
 def parse_constants(texts: Sequence[str]) -> dict[str, Any]:

@@ -31,6 +31,7 @@ from morphgen.model.robot import Robot
 from morphgen.processes import usable_cores
 from morphgen.progress import note, stage
 from morphgen.rl.baselines import BASELINES
+from morphgen.rl.config import spec_of
 from morphgen.rl.evaluation import (
     EvalConfig,
     episodes_for,
@@ -313,7 +314,9 @@ def _policy_scores(given: SimpleNamespace) -> dict[str, list[Score]]:
         given,
         sources[0],
         config,
-        method=name if is_named(name) else run.policy.agent,
+        method=name
+        if is_named(name)
+        else str(spec_of(run.policy, run.ppo, robot_source.tasks_of(run.source))),
         mode=given.mode or "",
         training_seed=run.seed,
         # A fine-tuned policy was trained before, by a run that its checkpoint does not describe.

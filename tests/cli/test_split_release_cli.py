@@ -163,11 +163,13 @@ def test_submissions_are_recorded_scored_and_ranked(run, ok, small):
     assert names == ["ik", "ik (reference)", "random (reference)"]
     assert "by the episodes of the release" in out
     brief = ("--steps", "64", "--envs", "4", "--set", "num_steps=16", "--set", "minibatches=4")
-    words = ("--agent", "me-mlp", *brief, "--sim", "mujoco", "--out", "r")
+    words = ("--agent", "me-mlp+tool-position", "--observe", "lag,joint", *brief)
+    words += ("--sim", "mujoco", "--out", "r")
     assert run("train", folder, *words)[0] == 0
     words = ("--mode", "deterministic", *few, "--submission", "policy.json")
     assert run("eval", "r", "--split", folder, *words)[0] == 0
     policy = json.loads(Path("policy.json").read_text())
+    assert policy["method"] == "me-mlp+tool-position+lag+joint"
     assert policy["training"] == {"simulator": "mujoco", "transitions": 64, "finetuned": 0}
 
 
