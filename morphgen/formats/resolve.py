@@ -378,7 +378,7 @@ def _data_roots() -> tuple[Path, ...]:
 
 def _listed(paths: list[Path]) -> str:
     """Return missing paths as text, with the most similar file name in the folder of the last."""
-    text = " and ".join(map(str, paths))
+    text = " and ".join(dict.fromkeys(map(str, paths)))
     folder, name = paths[-1].parent, paths[-1].name
     names = sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
     same = [other for other in names if other.lower() == name.lower()]

@@ -10,7 +10,7 @@ from itertools import islice
 
 from morphgen.errors import CompositionError, GrammarError
 from morphgen.grammar import values
-from morphgen.grammar.compose import part_values, require_root
+from morphgen.grammar.compose import require_root
 from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import (
     Chooser,
@@ -19,11 +19,15 @@ from morphgen.grammar.derive import (
     argument,
     count_fewest_parts,
     derive,
+    free_port,
+    production_weights,
     require_no_arguments,
+    require_no_yaw,
     require_part,
 )
 from morphgen.grammar.grammar_file import Grammar, find_grammar, load_grammar
 from morphgen.grammar.library import Library
+from morphgen.grammar.manifest import MOUNT_YAW
 from morphgen.grammar.part import load_part
 from morphgen.grammar.syntax import MAX_COUNT, MAX_FAULTS, MAX_PARTS, MAX_SEARCH, Alternative, Item
 
@@ -173,16 +177,15 @@ def _possible_alternatives(grammar: Grammar) -> dict[str, list[Alternative]]:
     return {
         production.symbol: [
             alternative
-            for alternative in production.alternatives
-            if alternative.weight is None or values.evaluate(alternative.weight, scope)[0] > 0
+            for alternative, weight in zip(
+                production.alternatives, production_weights(production, scope), strict=True
+            )
+            if weight > 0
         ]
         for production in grammar.productions
     }
 
 
-MAX_CHECKED = 500
-"""Largest number of structures whose ports ``check_grammar`` tests, for a finite grammar."""
-MAX_CHECKED_INFINITE = 40  # the same limit for a grammar with infinitely many structures
 INNER_QUANTILE = 0.381966
 """Quantile of a test value that is neither a bound nor the middle; 1 - 1 / golden ratio."""
 _TESTED: tuple[values.Draw, ...] = (
@@ -328,28 +331,73 @@ def _unused(grammar: Grammar) -> Iterator[str]:
 
 
 def _structure_faults(grammar: Grammar, library: Library) -> Iterator[str]:
-    """Derive structures to find ports that do not exist, and load their first parts."""
+    """Find ports that do not exist or are taken, and first parts that need a base."""
     start = grammar.production(grammar.start)
     location = start.location if start else grammar.name
-    is_infinite = count_structures(grammar) == math.inf
-    roots: set[str] = set()
-    num_structures = 0
     try:
-        structures = enumerate_structures(grammar, library)
-        limit = MAX_CHECKED_INFINITE if is_infinite else MAX_CHECKED
-        for structure in islice(structures, limit):
-            num_structures += 1
-            if structure.part not in roots:
-                roots.add(structure.part)
-                require_root(load_part(library.manifest(structure.part), part_values(structure)))
-    except CompositionError as error:
-        yield f"{location}: {error}"
-    except SearchError as error:
-        if num_structures == 0:  # otherwise the structures found so far are valid
-            yield f"{location}: {error}"
-    except GrammarError as error:
-        yield str(error)
-    else:
-        if num_structures == 0:
+        alternatives = _possible_alternatives(grammar)
+        _require_ports(alternatives, library)
+        scope, roots = _typical_scope(grammar), set()
+        for item in _first_items(grammar.start, alternatives):
+            manifest = library.manifest(item.name)
+            values = {
+                name: argument(item, name, expression, manifest.attached_parameters, scope)
+                for name, expression in item.arguments
+            }
+            require_no_yaw(item.name, values.pop(MOUNT_YAW, 0.0), location)
+            if item.name not in roots:
+                roots.add(item.name)
+                require_root(load_part(manifest, values))
+        if next(enumerate_structures(grammar, library), None) is None:
             limits = f"{MAX_PARTS} parts and {MAX_PARTS} levels"
             yield f"{location}: found no structure of at most {limits}"
+    except (CompositionError, SearchError) as error:
+        yield f"{location}: {error}"
+    except GrammarError as error:
+        yield str(error)
+
+
+def _first_items(start: str, alternatives: Mapping[str, Sequence[Alternative]]) -> list[Item]:
+    """Return the items that may become the first part of a robot."""
+    items: list[Item] = []
+    symbols = [start]
+    for symbol in symbols:  # which grows
+        for item in (alternative.items[0] for alternative in alternatives[symbol]):
+            if item.name not in alternatives:
+                items.append(item)
+            elif item.name not in symbols:
+                symbols.append(item.name)
+    return items
+
+
+_Trunk = tuple[str, frozenset[str]]
+"""A part that the next item is attached to, and its ports that are taken."""
+
+
+def _require_ports(alternatives: Mapping[str, Sequence[Alternative]], library: Library) -> None:
+    """Require that every item can be attached to every part that may come before it."""
+    last: dict[str, set[_Trunk]] = {symbol: set() for symbol in alternatives}
+    size = -1
+    while size != (size := sum(map(len, last.values()))):  # fixed point: symbols may be recursive
+        for symbol, each in alternatives.items():
+            for alternative in each:
+                last[symbol] |= _last_parts(alternative, last, library)
+
+
+def _last_parts(
+    alternative: Alternative, last: Mapping[str, set[_Trunk]], library: Library
+) -> set[_Trunk]:
+    """Return what the item after an alternative may be attached to, given that of symbols."""
+    trunks: set[_Trunk] = set()
+    for i, item in enumerate(alternative.items):
+        new = last.get(item.name, {(item.name, frozenset())})
+        low, high = item.repetition or (1, 1)
+        before, trunks = trunks, set()
+        for n in range(1, min(high, 2) + 1):  # further copies are attached as the second one
+            after = set() if i or n > 1 else set(new)
+            for part, taken in before:
+                port = free_port(part, library.manifest(part).ports, taken, item)
+                after |= {(part, taken | {port})} if item.port else new
+            trunks |= after if n >= min(low, 2) else set()
+            before = after
+    return trunks

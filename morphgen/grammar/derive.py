@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -145,10 +145,7 @@ class _Run:
         start = self._grammar.production(self._grammar.start)
         assert start  # the symbol of a production
         first, _ = self._sequence(self._alternative(start, start.symbol), "", start.symbol, 0)
-        if MOUNT_YAW in first.values:
-            raise GrammarError(
-                f"{start.location}: {first.part!r} is not attached to a port: it has no {MOUNT_YAW}"
-            )
+        require_no_yaw(first.part, first.values.get(MOUNT_YAW, 0.0), start.location)
         return first
 
     def _expand(
@@ -205,7 +202,8 @@ class _Run:
     def _alternative(self, production: Production, key: str) -> Alternative:
         weights = self._cache.weights.get(production.symbol)
         if weights is None:
-            weights = self._cache.weights[production.symbol] = self._weights(production, key)
+            scope = Scope(self._names, typical_value, key)
+            weights = self._cache.weights[production.symbol] = production_weights(production, scope)
         index = self._chooser.alternative(key, weights) if len(weights) > 1 else 0
         alternative = production.alternatives[index]
         if fewest := self._cache.fewest_parts:
@@ -224,20 +222,6 @@ class _Run:
                 f"{where.location}: more than {self._max_parts} parts: does it end?"
             )
 
-    def _weights(self, production: Production, key: str) -> list[float]:
-        scope, weights = Scope(self._names, typical_value, key), []
-        for expression in (alternative.weight for alternative in production.alternatives):
-            weight = 1.0 if expression is None else evaluate(expression, scope)[0]
-            if expression is not None and weight < 0:
-                raise GrammarError(f"{expression.location}: a weight is negative: {weight:g}")
-            weights.append(weight)
-        total, symbol = sum(weights), repr(production.symbol)
-        if not math.isfinite(total):
-            raise GrammarError(f"{production.location}: the sum of weights of {symbol} is infinite")
-        if total <= 0:
-            raise GrammarError(f"{production.location}: all weights of {symbol} are zero")
-        return weights
-
     def _part(self, item: Item, label: str, key: str) -> _Node:
         manifest = require_part(item, self._grammar, self._library)
         parameters = manifest.attached_parameters
@@ -253,6 +237,22 @@ class _Run:
         return node
 
 
+def production_weights(production: Production, scope: Scope) -> list[float]:
+    """Return the weights of a symbol's alternatives, of which one at least is positive."""
+    weights = []
+    for expression in (alternative.weight for alternative in production.alternatives):
+        weight = 1.0 if expression is None else evaluate(expression, scope)[0]
+        if expression is not None and weight < 0:
+            raise GrammarError(f"{expression.location}: a weight is negative: {weight:g}")
+        weights.append(weight)
+    total, symbol = sum(weights), repr(production.symbol)
+    if not math.isfinite(total):
+        raise GrammarError(f"{production.location}: the sum of weights of {symbol} is infinite")
+    if total <= 0:
+        raise GrammarError(f"{production.location}: all weights of {symbol} are zero")
+    return weights
+
+
 def count_fewest_parts(alternative: Alternative, fewest: Mapping[str, int]) -> int:
     """Return the smallest number of parts of an alternative, given that of each symbol."""
     return sum(
@@ -266,6 +266,12 @@ def require_no_arguments(symbol: Item) -> None:
         raise GrammarError(
             f"{symbol.location}: {symbol.name!r} is a symbol and takes no parameters"
         )
+
+
+def require_no_yaw(part: str, yaw: float, location: object) -> None:
+    """Require that the first part of a robot is not turned about a port."""
+    if yaw:
+        raise GrammarError(f"{location}: {part!r} is not attached to a port: it has no {MOUNT_YAW}")
 
 
 def require_part(item: Item, grammar: Grammar, library: Library) -> Manifest:
@@ -314,24 +320,27 @@ def _with_unique_keys(scope: Scope) -> Scope:
 
 
 def _attach(trunk: _Node, node: _Node, item: Item) -> None:
-    port, where = item.port or _default_port(trunk, item), item.location
-    if port not in trunk.ports:
-        valid = nearest(port, trunk.ports)
-        raise GrammarError(f"{where}: {trunk.part!r} has no port {port!r}{valid}")
-    if port in dict(trunk.children):
-        raise GrammarError(f"{where}: port {port!r} of {trunk.part!r} is already taken")
+    port = free_port(trunk.part, trunk.ports, dict(trunk.children), item)
     trunk.children.append((port, node))
 
 
-def _default_port(trunk: _Node, item: Item) -> str:
-    ports = [port for port in DEFAULT_PORTS if port in trunk.ports]
-    if ports or len(trunk.ports) == 1:
-        return (*ports, *trunk.ports)[0]
-    if not trunk.ports:
-        raise GrammarError(
-            f"{item.location}: nothing can be attached to {trunk.part!r}: it has no port"
-        )
+def free_port(part: str, ports: Collection[str], taken: Collection[str], item: Item) -> str:
+    """Return the port of a part that an item is attached to."""
+    port, where = item.port or _default_port(part, ports, item), item.location
+    if port not in ports:
+        raise GrammarError(f"{where}: {part!r} has no port {port!r}{nearest(port, ports)}")
+    if port in taken:
+        raise GrammarError(f"{where}: port {port!r} of {part!r} is already taken")
+    return port
+
+
+def _default_port(part: str, ports: Collection[str], item: Item) -> str:
+    default = [port for port in DEFAULT_PORTS if port in ports]
+    if default or len(ports) == 1:
+        return (*default, *ports)[0]
+    if not ports:
+        raise GrammarError(f"{item.location}: nothing can be attached to {part!r}: it has no port")
     raise GrammarError(
-        f"{item.location}: name the port of {trunk.part!r}, such as "
-        f"{trunk.ports[0]}:{item.name}; ports: {', '.join(trunk.ports)}"
+        f"{item.location}: name the port of {part!r}, such as "
+        f"{next(iter(ports))}:{item.name}; ports: {', '.join(ports)}"
     )

@@ -92,6 +92,7 @@ def test_a_missing_mesh_is_an_error(tmp_path):
     with pytest.raises(UnsoundError, match=r"gone\.stl") as caught:
         reading(urdf(base=MESH.format("gone.stl")), tmp_path)
     assert caught.value.findings[0].code == "mesh-unresolved"
+    assert str(caught.value).count("gone.stl") == 2  # as written, and where it was looked for
     sent = pickle.loads(pickle.dumps(caught.value))  # as a worker process sends it
     assert (str(sent), sent.findings) == (str(caught.value), caught.value.findings)
 

@@ -89,6 +89,15 @@ def test_huge_numbers_of_structures_are_counted_quickly(lines, number):
     assert count != math.inf
 
 
+def test_ports_of_more_structures_than_can_be_listed_are_checked():
+    lines = "robot -> first a{1,100} cube", "a -> " + "|".join(["bead"] * 11)
+    began = time.process_time()
+    assert check_grammar(grammar(*lines, "first -> slides | post"), LIBRARY) == []
+    (fault,) = check_grammar(grammar(*lines, "first -> slides | cube"), LIBRARY)
+    assert fault == "g:1:16: nothing can be attached to 'cube': it has no port"
+    assert time.process_time() - began < 0.5
+
+
 @pytest.mark.parametrize("last", ["a64 -> bead", "a64 -> bead | beam"])
 def test_a_grammar_with_only_too_large_robots_has_a_fault(last):
     robot_grammar = grammar("robot -> slides a0", *DOUBLING, last)
