@@ -11,10 +11,9 @@ from typing import Any, TypeVar
 
 from morphgen.errors import FormatError
 from morphgen.files import file_stamp
-from morphgen.formats.bundle import CARD
+from morphgen.formats.bundle import CARD, part_licences
 from morphgen.formats.data_files import read_json
 from morphgen.formats.description import SUFFIXES, is_mjcf
-from morphgen.formats.ros_package import part_licences
 from morphgen.grammar.catalogue import known_facts, stored_facts
 from morphgen.grammar.library import Library
 from morphgen.grammar.robot_set import INDEX, read_index, read_settings

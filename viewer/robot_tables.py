@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 
 from morphgen.benchmark.licences import find_licence
-from morphgen.formats.ros_package import part_licences
+from morphgen.formats.bundle import part_licences
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh, Shape, dimensions
 from morphgen.model.robot import Joint, Link, Robot

@@ -15,16 +15,15 @@ from types import SimpleNamespace
 
 from morphgen.api.checks import bundle_of
 from morphgen.arguments import path_argument, require_types, text_argument
-from morphgen.checks.robot_srdf import (
+from morphgen.checks.srdf import (
     MATRIX_SAMPLES,
-    collision_matrix,
-    matrix_evidence,
+    require_tool,
     robot_srdf_text,
 )
 from morphgen.errors import FormatError, nearest
 from morphgen.extras import explain_missing_extras
 from morphgen.files import write_atomic
-from morphgen.fitting.replace_collision import SPHERES, as_spheres, link_spheres
+from morphgen.fitting.replace_collision import as_spheres, link_spheres
 from morphgen.formats.bundle import (
     MESHES,
     MJCF,
@@ -34,14 +33,19 @@ from morphgen.formats.bundle import (
     write_fits,
     write_meshes,
 )
+from morphgen.formats.exchange import (
+    MODEL_CONFIG,
+    MODEL_SDF,
+    convert_urdf,
+    glb_bytes,
+    model_config_text,
+    ros_package_name,
+    sdf_text,
+    write_ros_package,
+)
 from morphgen.formats.files import writing_export
-from morphgen.formats.glb import glb_bytes
 from morphgen.formats.mjcf.write import mjcf_text
-from morphgen.formats.ros_package import ros_package_name, write_ros_package
-from morphgen.formats.sdf import MODEL_CONFIG, MODEL_SDF, model_config_text, sdf_text
-from morphgen.formats.srdf import CUROBO_CONFIG, curobo_text, require_tool
 from morphgen.formats.urdf.write import MeshUri, urdf_text
-from morphgen.formats.usd import convert_urdf
 from morphgen.grammar.library import LibraryFolders, default_library
 from morphgen.grammar.robot_source import RobotLike, RobotReference, find_robot, read_source
 from morphgen.model.robot import Robot
@@ -69,7 +73,7 @@ def export(
     Args:
         robot: The robot, its bundle's folder, a description, or words of ``compose``.
         format: A file: ``html``, ``mp4``, ``gif``, ``glb`` or ``srdf``; or a folder: ``urdf``,
-            ``mjcf``, ``sdf``, ``curobo``, ``usd`` or ``ros2``.
+            ``mjcf``, ``sdf``, ``usd`` or ``ros2``.
         out: Output folder; by default the robot's bundle for a file, its parent for a folder, and
             the current folder for other robots.
         dark: Whether an ``html`` page is dark.
@@ -92,7 +96,7 @@ def export(
     require_types(given, FormatError, samples=1, seed=0, spheres=1)
     if text_argument("format", format, FormatError) not in (valid := (*FILES, *FOLDERS)):
         raise FormatError(f"unknown format {format!r}{nearest(format, valid)}")
-    pairs = ("srdf", "curobo", "ros2")
+    pairs = ("srdf", "ros2")
     only = {"dark": ("html",), "samples": pairs, "seed": pairs, "spheres": ("srdf", *FOLDERS)}
     for name, formats in only.items():
         is_given = getattr(given, name) is not None and getattr(given, name) is not False
@@ -176,13 +180,12 @@ def _srdf_text(robot: Robot, sphered: Robot, given: SimpleNamespace) -> str:
     )
 
 
-def _with_spheres(robot: Robot, given: SimpleNamespace, default: int | None = None) -> Robot:
+def _with_spheres(robot: Robot, given: SimpleNamespace) -> Robot:
     """Return the robot with the spheres that are asked for as its collision shapes, if any."""
-    number = given.spheres or default
-    if number is None:
+    if given.spheres is None:
         return robot
     folders = default_library(given.library).folders  # with the parts' stored fits
-    return as_spheres(robot, folders, spheres=number, cover=given.cover)
+    return as_spheres(robot, folders, spheres=given.spheres, cover=given.cover)
 
 
 def _with_meshes(robot: Robot, folder: Path, texts: str) -> None:
@@ -197,16 +200,6 @@ def _with_meshes(robot: Robot, folder: Path, texts: str) -> None:
 
 def _meshed(robot: Robot, folder: Path, given: SimpleNamespace) -> None:
     _with_meshes(_with_spheres(robot, given), folder, given.format)
-
-
-def _curobo(robot: Robot, folder: Path, given: SimpleNamespace) -> None:
-    require_tool(robot)
-    robot = _with_spheres(robot, given, SPHERES)
-    matrix = collision_matrix(robot, samples=given.samples or MATRIX_SAMPLES, seed=given.seed or 0)
-    evidence = matrix_evidence(robot, matrix)
-    text = curobo_text(robot, link_spheres(robot), matrix.reasons, URDF, evidence)
-    _with_meshes(robot, folder, "urdf")
-    (folder / CUROBO_CONFIG).write_text(text, encoding="utf-8")
 
 
 def _usd(robot: Robot, folder: Path, given: SimpleNamespace) -> None:
@@ -243,7 +236,6 @@ FOLDERS: Mapping[str, Callable[[Robot, Path, SimpleNamespace], None]] = {
     "urdf": _meshed,
     "mjcf": _meshed,
     "sdf": _meshed,
-    "curobo": _curobo,
     "usd": _usd,
     "ros2": _ros2,
 }

@@ -24,6 +24,7 @@ import numpy as np
 from platformdirs import user_cache_path
 
 from morphgen.checks.self_collision import survey_collisions
+from morphgen.checks.srdf import LinkSpheres
 from morphgen.errors import FitError, FormatError, nearest, one_line
 from morphgen.files import keep_file
 from morphgen.formats.files import replacing_folder
@@ -39,7 +40,6 @@ from morphgen.formats.fits import (
     shapes_scale,
 )
 from morphgen.formats.rounding import as_written
-from morphgen.formats.srdf import LinkSpheres
 from morphgen.model.geometry import Mesh, Shape, Sphere, StoredFit, StoredFits
 from morphgen.model.mesh import convex_hull, is_flat, load_mesh
 from morphgen.model.robot import Link, Robot

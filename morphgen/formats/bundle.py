@@ -13,7 +13,7 @@ from typing import Any
 
 from msgspec import field
 
-from morphgen.errors import FormatError
+from morphgen.errors import FormatError, one_line
 from morphgen.files import file_sha256
 from morphgen.formats.data_files import read_json
 from morphgen.formats.description import read_description
@@ -331,6 +331,18 @@ def robot_card(
 def card_text(card: Mapping[str, object]) -> str:
     """Return a card as JSON text."""
     return json.dumps(card, indent=2, ensure_ascii=False) + "\n"
+
+
+def part_licences(card: Mapping[str, object]) -> tuple[str, ...]:
+    """Return the licences of a robot's parts by its provenance or card; none without parts."""
+    parts = card.get("parts")
+    rows = parts if isinstance(parts, list) else []
+    names = [
+        one_line(str(part["licence"]))
+        for part in rows
+        if isinstance(part, Mapping) and "licence" in part
+    ]
+    return tuple(dict.fromkeys(names))
 
 
 def apply_card(robot: Robot, card: Mapping[str, Any], origin: str) -> Robot:

@@ -20,14 +20,13 @@ from helpers.parts import PINCER
 from helpers.robots import arm
 from morphgen.api import export
 from morphgen.checks.readers import LOADERS
-from morphgen.checks.robot_srdf import MATRIX_SAMPLES, robot_srdf_text
+from morphgen.checks.srdf import MATRIX_SAMPLES, read_srdf, robot_srdf_text
 from morphgen.cli import main
 from morphgen.cli.command import read_commands
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.formats.bundle import EXPORTS, file_findings, read_bundle, write_bundle
 from morphgen.formats.files import MANIFEST
 from morphgen.formats.fits import FITS
-from morphgen.formats.srdf import read_srdf
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.rl.config import SWITCHES
 from morphgen.tasks.registry import Registry
@@ -500,7 +499,7 @@ def test_the_help_has_the_formats_and_the_default_number_of_samples():
     assert f"default: {MATRIX_SAMPLES:,}" in command.options["--samples"]["help"]
 
 
-@pytest.mark.parametrize("name", ["srdf", "ros2", "curobo"])
+@pytest.mark.parametrize("name", ["srdf", "ros2"])
 def test_export_without_a_tool_is_refused_before_the_fit(tmp_path, monkeypatch, name, refused):
     monkeypatch.setattr(export, "as_spheres", lambda *given, **_: pytest.fail("fitted"))
     bundle = write_bundle(replace(arm(), frames=()), tmp_path / "a", picture=False)

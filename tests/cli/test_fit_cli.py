@@ -8,14 +8,13 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
-import yaml
 
 from helpers.commands import tree
 from helpers.parts import write_part
 from helpers.robots import arm
+from morphgen.checks.srdf import read_srdf
 from morphgen.fitting.quality import Quality
 from morphgen.formats.bundle import read_bundle, write_bundle
-from morphgen.formats.srdf import read_srdf
 from morphgen.formats.urdf.read import read_urdf
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
@@ -183,7 +182,7 @@ def test_fit_writes_a_bundle_whose_urdf_and_mjcf_have_spheres_alone(ok, balls, t
 
 def test_exports_have_the_same_spheres(ok, balls, tmp_path):
     options = ("--spheres", "2", "--cover", "0.9", "--out", tmp_path)
-    for name in ("urdf", "srdf", "curobo"):
+    for name in ("urdf", "srdf"):
         samples = () if name == "urdf" else ("--samples", "200")
         ok("export", balls, "--format", name, *options, *samples)
     expected = spheres_of(read_urdf(tmp_path / "arm-urdf" / "robot.urdf", written_frames=True))
@@ -195,26 +194,6 @@ def test_exports_have_the_same_spheres(ok, balls, tmp_path):
         ]
         for link in srdf.iterfind("link_sphere_approximation")
     }
-    config = yaml.safe_load((tmp_path / "arm-curobo" / "robot.yml").read_text())
-    kinematics = config["robot_cfg"]["kinematics"]
-    assert expected == {
-        link: [(*s["center"], s["radius"]) for s in spheres]
-        for link, spheres in kinematics["collision_spheres"].items()
-    }
-    urdf = tmp_path / "arm-curobo" / kinematics["urdf_path"]
-    assert spheres_of(read_urdf(urdf, written_frames=True)) == expected
-
-
-@pytest.mark.slow
-def test_curobo_has_eight_spheres_for_a_link_by_default_and_keeps_those_of_a_link(
-    ok, balls, tmp_path
-):
-    words = ("--format", "curobo", "--samples", "50", "--out", tmp_path)
-    ok("export", balls, *words)
-    config = yaml.safe_load((tmp_path / "arm-curobo" / "robot.yml").read_text())
-    spheres = config["robot_cfg"]["kinematics"]["collision_spheres"]
-    assert {link: len(of_link) for link, of_link in spheres.items()} == counts(8)
-    assert spheres["left"] == [{"center": [0.0, 0.0, 0.05], "radius": 0.02}]
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from helpers.robots import arm
 from morphgen.cli import main
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import write_bundle
-from morphgen.formats.usd import convert_urdf
+from morphgen.formats.exchange import convert_urdf
 from morphgen.model.geometry import Mesh, Pose
 
 pytest.importorskip("urdf_usd_converter")

@@ -1,21 +1,26 @@
-"""The SRDF of a robot: its groups, home and end-effectors, and the pairs that need no test."""
+"""Read and write SRDF, MoveIt's description beside a URDF: groups, and pairs that need no test."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 from lxml import etree
 
 from morphgen.checks.self_collision import ALWAYS_SHARE, SelfCollisionChecker, adjacent_pairs
-from morphgen.formats.srdf import LinkSpheres, require_tool
+from morphgen.errors import FormatError, nearest, shortened
+from morphgen.formats.data_files import read_bytes
+from morphgen.formats.xml import parse_xml, read_schema
 from morphgen.model.geometry import Mesh
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import TOOL, Frame, Pair, Robot, sorted_pair
+from morphgen.model.rotation import Vec3
 from morphgen.model.tree import below
 
 Reason = Literal["Adjacent", "Default", "Always", "Never", "User"]
@@ -24,22 +29,10 @@ REASONS: tuple[Reason, ...] = ("Adjacent", "Default", "Always", "Never", "User")
 MATRIX_SAMPLES = 10_000  # number of sampled configurations, the default of MoveIt's setup assistant
 
 
-@dataclass(frozen=True)
-class CollisionMatrix:
-    """Pairs of links whose collisions need no test, with reasons and evidence."""
-
-    reasons: dict[Pair, Reason]  # reason of every pair that needs no test, the pairs sorted
-    collisions: dict[Pair, int]
-    """Number of sampled configurations in which a pair collides, for pairs that collide in any."""
-    num_pairs: int  # number of pairs of links with collision shapes
-    samples: int  # number of sampled configurations
-    seed: int  # seed of the configurations
-
-
 def collision_matrix(
     robot: Robot, *, samples: int = MATRIX_SAMPLES, seed: int = 0
-) -> CollisionMatrix:
-    """Find the pairs of links whose collisions need no test, with the reasons of docs/bundle.md.
+) -> dict[Pair, Reason]:
+    """Return pairs of links whose collisions need no test, with the reasons of docs/bundle.md.
 
     As in all collision checks, meshes count as their convex hulls. These contain their meshes, so a
     pair that never collides is safe for planners that test the meshes, too.
@@ -65,9 +58,7 @@ def collision_matrix(
             reasons[pair] = "Always"
         elif not collisions[pair]:
             reasons[pair] = "Never"
-    return CollisionMatrix(
-        dict(sorted(reasons.items())), dict(sorted(collisions.items())), len(pairs), samples, seed
-    )
+    return dict(sorted(reasons.items()))
 
 
 def _with_loose_joints(robot: Robot) -> tuple[Robot, list[int]]:
@@ -98,7 +89,7 @@ def robot_srdf_text(
     robot with several limbs are named after them, such as ``left_arm``.
     """
     require_tool(robot)
-    matrix = collision_matrix(robot, samples=samples, seed=seed)
+    reasons = collision_matrix(robot, samples=samples, seed=seed)
     root = etree.Element("robot", name=robot.name)
     _write_limbs(root, robot, [*_limbs(robot)])
     for link, balls in spheres:
@@ -106,8 +97,9 @@ def robot_srdf_text(
         for center, radius in balls:
             values = {"center": _numbers(*center), "radius": _numbers(radius)}
             etree.SubElement(element, "sphere", values)
-    root.append(etree.Comment(f" {matrix_evidence(robot, matrix)} "))
-    for (a, b), reason in matrix.reasons.items():
+    evidence = _evidence(robot, reasons, f"{samples} configurations sampled with seed {seed}")
+    root.append(etree.Comment(f" {evidence} "))
+    for (a, b), reason in reasons.items():
         etree.SubElement(root, "disable_collisions", link1=a, link2=b, reason=reason)
     etree.indent(root)
     return etree.tostring(root, encoding="unicode") + "\n"
@@ -145,16 +137,16 @@ def _numbers(*values: float) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def matrix_evidence(robot: Robot, matrix: CollisionMatrix) -> str:
+def _evidence(robot: Robot, reasons: Mapping[Pair, Reason], sampled: str) -> str:
     """Return sentences about how pairs that need no test were found, and how many."""
-    count = Counter(matrix.reasons.values())
+    count = Counter(reasons.values())
     counts = ", ".join(f"{count[reason]} {reason}" for reason in REASONS)
     shapes = (shape.geometry for link in robot.links for shape in link.collisions)
     has_mesh = any(isinstance(shape, Mesh) for shape in shapes)
     about_meshes = " Meshes count as their convex hulls." if has_mesh else ""
+    num_pairs = math.comb(sum(bool(link.collisions) for link in robot.links), 2)
     return (
-        f"{matrix.num_pairs} pairs of links with collision shapes, "
-        f"{matrix.samples} configurations sampled with seed {matrix.seed}. Disabled: {counts}. "
+        f"{num_pairs} pairs of links with collision shapes, {sampled}. Disabled: {counts}. "
         f"Always: in collision in at least {ALWAYS_SHARE:.0%} of the configurations. "
         "Never: in collision in none of them. User: ignored by the robot for another reason."
         f"{about_meshes}"
@@ -207,3 +199,78 @@ def _gripper_links(robot: Robot, tool: Frame) -> list[str]:
     if links[0] == moving[-1] + 1:
         links = links[1:]
     return [robot.links[i].name for i in links]
+
+
+class LinkSpheres(NamedTuple):
+    """Spheres that approximate a link."""
+
+    link: str
+    spheres: tuple[tuple[Vec3, float], ...]
+    """Centre in the link's frame and radius of each [m]; MoveIt gives a link no collision shape if
+    its only sphere has radius zero."""
+
+
+def require_tool(robot: Robot) -> None:
+    """Require that a robot has the frame ``tool``, which an SRDF and planners need."""
+    if robot.tool is None:
+        raise FormatError(
+            f"robot {robot.name!r} has no frame {TOOL!r}, where its arm ends; import it with a "
+            "tool (morphgen import FILE --tool LINK)"
+        )
+
+
+MAX_SRDF_BYTES = 16 * 2**20  # size of the largest SRDF that is read [bytes]
+
+
+def read_srdf(path: Path) -> etree._Element:
+    """Return the root of an SRDF file, whose pairs of links are complete."""
+    return parse_srdf(read_bytes(path, MAX_SRDF_BYTES), str(path))
+
+
+def parse_srdf(data: bytes, origin: str) -> etree._Element:
+    """Return the root of SRDF text; see ``read_srdf``."""
+    root, schema = parse_xml(data, origin), read_schema("srdf")
+    if root.tag != "robot":
+        raise FormatError(f"{origin}: root element <{shortened(str(root.tag))}>; expected <robot>")
+    for element in root:
+        tag, attributes = str(element.tag), element.attrib
+        where = f"{origin}:{element.sourceline}: <{shortened(tag)}>"
+        if tag not in schema.children["robot"]:
+            raise FormatError(
+                f"{where} is unknown in <robot>{nearest(tag, schema.children['robot'])}"
+            )
+        rules = {attribute.name: attribute.required for attribute in schema.attributes.get(tag, ())}
+        for name in (name for name, is_required in rules.items() if is_required):
+            if not attributes.get(name):
+                raise FormatError(f"{where}: missing attribute {name!r}")
+        for name in map(str, attributes) if rules else ():
+            if name not in rules:
+                hint = nearest(name, rules)
+                raise FormatError(f"{where}: unknown attribute {shortened(name)!r}{hint}")
+    return root
+
+
+def disabled_link_pairs(root: etree._Element, links: Iterable[str]) -> tuple[Pair, ...]:
+    """Return the pairs of links whose collisions an SRDF disables, sorted."""
+
+    def pairs_of(tag: str) -> set[Pair]:
+        return {sorted_pair(e.get("link1", ""), e.get("link2", "")) for e in root.iterfind(tag)}
+
+    unchecked = [element.get("link", "") for element in root.iterfind("disable_default_collisions")]
+    pairs = {sorted_pair(a, b) for a in unchecked for b in links}
+    pairs = (pairs - pairs_of("enable_collisions")) | pairs_of("disable_collisions")
+    return tuple(sorted((a, b) for a, b in pairs if a != b))
+
+
+def with_disabled_pairs(robot: Robot, root: etree._Element, origin: str = "SRDF") -> Robot:
+    """Return a robot that also ignores contacts of the links that an SRDF disables."""
+    frames = {frame.name for frame in robot.frames}
+    pairs = disabled_link_pairs(root, robot.link_index)
+    for name in dict.fromkeys(link for pair in pairs for link in pair):
+        if name not in robot.link_index and name not in frames:
+            raise FormatError(
+                f"{origin}: robot {robot.name!r} has no link {shortened(name)!r}"
+                + nearest(name, robot.link_index)
+            )
+    known = {pair for pair in pairs if robot.link_index.keys() >= set(pair)}
+    return replace(robot, ignore_pairs=tuple(sorted({*robot.ignore_pairs, *known})))
