@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -25,8 +25,6 @@ from morphgen.tasks.scenes.robot_tables import RobotTables
 from morphgen.tasks.sim.base import Simulation, is_host
 from morphgen.tasks.task import EnvSpec, StepResult
 from morphgen.tasks.task_groups import TaskGroups
-
-_FLAGS = ("terminated", "truncated", "diverged", "success")
 
 
 @dataclass(eq=False, kw_only=True)  # not frozen, as no dataclass can be whose base is not
@@ -208,31 +206,18 @@ class TaskBatch:
             self.episode_step.copy_(random.integers(Stream.SPREAD, self.max_episode_steps))
         return self.observe()
 
-    def step(self, actions: torch.Tensor, hold: torch.Tensor | None = None) -> Step:
+    def step(self, actions: torch.Tensor) -> Step:
         """Act for one control step.
 
         Args:
             actions: Shape (n, L); continuous: in [-1, 1], clipped; discrete: indices of ``BINS``.
-            hold: Environments whose episode has just begun and begins with the next step instead,
-                shape (n,), bool: they ignore their action, and their reward is 0.
 
         Raises:
             TaskError: If the actions are invalid.
             SimulationError: If the simulator failed.
         """
-        held_episode = None if hold is None else self._episodes.next_episode - 1
         before = self.act(actions)
-        diverged = self.simulation.step(before.targets)
-        step = self.finish(before, diverged)
-        if hold is None or held_episode is None:
-            return step
-        # What happened to these environments in the step is undone: their episode begins again.
-        next_episode = torch.where(hold, held_episode, self._episodes.next_episode)
-        self._episodes.restart(self.seed, next_episode)
-        self._begin(hold)
-        flags = {name: getattr(step, name) & ~hold for name in _FLAGS}
-        reward = step.reward.masked_fill(hold, 0)
-        return replace(step, observation=self.observe(), reward=reward, **flags)
+        return self.finish(before, self.simulation.step(before.targets))
 
     def act(self, actions: torch.Tensor) -> BeforePhysics:
         """Advance the joint targets by the actions: the part of ``step`` before the physics.

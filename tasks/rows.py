@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
+from morphgen.model.kinematics_torch import angle_between
 from morphgen.tasks.task import A, GoalSet
 
 T = TypeVar("T")
@@ -77,6 +78,15 @@ def rotated(quaternions: A, vectors: A) -> A:
         -1,
     )
     return turned
+
+
+def angles_between(rotations: A, others: A) -> A:
+    """Return the angles between rotation matrices (n, 3, 3), shape (n,) [rad]."""
+    if isinstance(rotations, torch.Tensor):
+        return angle_between(rotations, others)
+    apart = math.hypot(*(rotations - others).ravel().tolist())
+    angle: A = _number(2 * math.asin(min(apart / math.sqrt(8), 1.0)))
+    return angle
 
 
 def choose(condition: A, value: float, otherwise: A | float = 0.0) -> A:

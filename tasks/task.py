@@ -79,11 +79,15 @@ class StepFormulas(ABC, Generic[A]):
 
     @abstractmethod
     def evaluate(self, state: TaskState[A]) -> StepResult[A]:
-        """Return the result of a step."""
+        """Return the result of a step, and advance whatever depends on time."""
 
     @abstractmethod
     def observe(self, object_pose: A) -> dict[str, A]:
-        """Return the task's observation fields by name from poses of the object, shape (k, 7)."""
+        """Return the task's observation fields by name, shape (k, size) each.
+
+        Args:
+            object_pose: Poses of the object, shape (k, 7).
+        """
 
 
 class TaskConfig:
@@ -256,10 +260,9 @@ class TaskEnvs(ABC):
     """
 
     needs_tool_rotation: bool = False
-    """Whether ``evaluate`` needs ``TaskState.tool_rotation``."""
+    """Whether the formulas need ``TaskState.tool_rotation``."""
     formulas: StepFormulas[torch.Tensor]
-    """Formulas that ``evaluate`` and ``observe`` call. With them ``TaskEnv`` steps one environment
-    in NumPy, several times as fast; without them, a task must override both methods."""
+    """What a step computes; ``TaskEnv`` has the same formulas for one environment in NumPy."""
 
     @abstractmethod
     def begin(
@@ -279,18 +282,6 @@ class TaskEnvs(ABC):
             Joint positions at the start, shape (k, J), and poses of the object, shape (k, 7), zeros
             if there is none. Rows outside of the mask are ignored.
         """
-
-    def evaluate(self, state: TaskState[torch.Tensor]) -> StepResult[torch.Tensor]:
-        """Return the result of a step, and advance whatever depends on time."""
-        return self.formulas.evaluate(state)
-
-    def observe(self, object_pose: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Return the task's observation fields by name, each of shape (k, size).
-
-        Args:
-            object_pose: Pose of the object, shape (k, 7).
-        """
-        return self.formulas.observe(object_pose)
 
     def target_points(self, object_pose: torch.Tensor) -> torch.Tensor:
         """Return points that the tool should visit, shape (k, P, 3) [m]; P is 0 by default.

@@ -28,20 +28,6 @@ from morphgen.tasks.task import (
 _FLAGS, _NUMBERS = ("success", "terminated"), ("distance", "score")
 
 
-def _require_methods(task: str, envs: TaskEnvs) -> None:
-    """Require ``evaluate`` and ``observe``, or the formulas that ``TaskEnvs`` calls for them."""
-    kind = type(envs)
-    lacking = [
-        name for name in ("evaluate", "observe") if getattr(kind, name) is getattr(TaskEnvs, name)
-    ]
-    if lacking and not isinstance(getattr(envs, "formulas", None), StepFormulas):
-        raise TaskError(
-            f"task {task!r}: {kind.__name__} has no {' and no '.join(lacking)}; expected "
-            f"{'this method' if len(lacking) == 1 else 'these methods'}, or `formulas`: "
-            "StepFormulas, which have both"
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class _Group:
     """The environments of one task."""
@@ -61,8 +47,8 @@ class _Group:
         return {"q": q, "object_pose": object_pose}
 
     def result(self, state: TaskState[torch.Tensor]) -> StepResult[torch.Tensor]:
-        """Return the result of ``TaskEnvs.evaluate``."""
-        result = self.envs.evaluate(state)
+        """Return the result of ``StepFormulas.evaluate``."""
+        result = self.envs.formulas.evaluate(state)
         is_result = isinstance(result, StepResult)
         require_returned(self.task.name, "evaluate", result, is_result, "a StepResult")
         if not result.terms:
@@ -76,8 +62,8 @@ class _Group:
         return result
 
     def fields(self, object_pose: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Return the values of ``TaskEnvs.observe``: one for each field that the task declares."""
-        values = self.envs.observe(object_pose)
+        """Return what ``StepFormulas.observe`` does: a value for each field of the task."""
+        values = self.envs.formulas.observe(object_pose)
         sizes = {field.name: field.size for field in self.task.fields}
         for name in sizes.keys() ^ values.keys():
             fault = f"the field {name!r} is missing"
@@ -129,7 +115,9 @@ class TaskGroups:
             rows, member_index = torch.tensor(pairs, device=device).T.contiguous()
             envs = task.make_envs([specs[i] for i in members], member_index, num_joints)
             require_returned(name, "make_envs", envs, isinstance(envs, TaskEnvs), "TaskEnvs")
-            _require_methods(name, envs)
+            if not isinstance(getattr(envs, "formulas", None), StepFormulas):
+                kind = type(envs).__name__
+                raise TaskError(f"task {name!r}: {kind} has no `formulas`; expected StepFormulas")
             self._groups[name] = _Group(task, envs, rows)
             self._row[rows] = torch.arange(len(rows), device=device)
             self.max_episode_steps[rows] = config.max_episode_steps

@@ -239,7 +239,7 @@ make_env("reach", workers=2) => unknown option 'workers'
 make_env("reach", ["prims"]) => name several with num_envs
 make_env("reach", [], num_envs=2) => expected at least one robot
 make_env("reach", num_envs=2, config=3) => int is not the config of reach
-make_env("reach", num_envs=2, autoreset_mode="Disabled") => autoreset_mode Disabled: expected SAME_S
+make_env("reach", num_envs=2, autoreset_mode="NextStep") => unknown option 'autoreset_mode'
 prims_env(num_envs=0) => 0 environments
 export("prims", "gltf") => unknown format 'gltf'; did you mean 'glb'
 export("prims", "gif", dark=True) => dark: only with format html

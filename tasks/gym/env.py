@@ -1,4 +1,4 @@
-"""One robot at a task as a plain Gymnasium environment, which steps in NumPy where it can.
+"""One robot at a task as a plain Gymnasium environment, which steps in NumPy.
 
 A call of torch takes microseconds however small its tensors are, and a step makes a hundred; a call
 of NumPy takes a tenth of that. A step in NumPy equals ``TaskBatch.step`` to the rounding of single
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
 from morphgen.grammar.robot_source import RobotLike
-from morphgen.model.kinematics import FramePosition
+from morphgen.model.kinematics import FramePosition, frame_pose
 from morphgen.tasks.actions import ActionDecoder, JointMotion
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.gym.vector import (
@@ -41,7 +41,7 @@ from morphgen.tasks.rows import numpy_row
 from morphgen.tasks.scenes.env_specs import GoalConfig
 from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.sim.base import Contacts
-from morphgen.tasks.task import STANDARD_FIELDS, StepFormulas, StepResult, TaskConfig, TaskEnvs
+from morphgen.tasks.task import STANDARD_FIELDS, StepFormulas, StepResult, TaskConfig
 
 EnvStep = tuple[NumpyObservation, float, bool, bool, dict[str, Any]]
 """Observation, reward, whether terminated, whether truncated, and info, as of Gymnasium."""
@@ -59,8 +59,10 @@ class NumpyStepper:
     ) -> None:
         """Take views of the batch's tensors; ``begin`` must follow."""
         self._batch, self._unpadded = batch, unpadded
-        robot = batch.specs[0].robot
-        self._formulas: StepFormulas[Array] = numpy_row(_envs(batch).formulas)
+        envs = batch.groups[batch.specs[0].task]
+        self._robot = robot = batch.specs[0].robot
+        self._formulas: StepFormulas[Array] = numpy_row(envs.formulas)
+        self._needs_tool_rotation = envs.needs_tool_rotation
         self._decode: ActionDecoder[Array] = numpy_row(batch.decode_actions)
         self._motion: JointMotion[Array] = numpy_row(batch.motion)
         self._tokens: LinkTokens[Array] = batch.observation.tokens.numpy_row()
@@ -99,15 +101,16 @@ class NumpyStepper:
         diverged = self._simulate()
         steps = self._episode_step.item() + 1
         self._episode_step[0] = steps
-        result = self._formulas.evaluate(
-            self._motion.task_state(
-                self._q,
-                self._qd,
-                tool=self._tool(),
-                object_pose=self._object_pose,
-                diverged=np.asarray(diverged)[()],
-            )
+        state = self._motion.task_state(
+            self._q,
+            self._qd,
+            tool=self._tool(),
+            object_pose=self._object_pose,
+            diverged=np.asarray(diverged)[()],
         )
+        if self._needs_tool_rotation:
+            state.tool_rotation = frame_pose(self._robot, self._q)[:3, :3].astype(np.float32)
+        result = self._formulas.evaluate(state)
         observation = {"tokens": self._tokens(self._q)[self._rows]}
         for name, values in self._formulas.observe(self._object_pose).items():
             observation[name] = values.copy()
@@ -132,18 +135,6 @@ class NumpyStepper:
     def _tool(self) -> Array:
         """Return the position of the tool, shape (3,) [m]."""
         return np.array(self._tool_position(self._q.tolist()), np.float32)
-
-
-def _envs(batch: TaskBatch) -> TaskEnvs:
-    return batch.groups[batch.specs[0].task]
-
-
-def steps_in_numpy(batch: TaskBatch) -> bool:
-    """Return whether the task of a batch of one steps by formulas, which serve NumPy, too."""
-    envs = _envs(batch)
-    kind = type(envs)
-    by_formulas = kind.evaluate is TaskEnvs.evaluate and kind.observe is TaskEnvs.observe
-    return by_formulas and not envs.needs_tool_rotation and batch.device.type == "cpu"
 
 
 def _info(result: StepResult[Any], diverged: bool) -> dict[str, Any]:
@@ -182,9 +173,8 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
 
     ``reset(seed=s)`` begins the same episodes as environment 0 of ``make_batch(..., seed=s)``.
 
-    A task whose ``TaskEnvs`` has ``formulas``, as all of morphgen's have, steps in NumPy on the CPU
-    (``NumpyStepper``), several times as fast as the batch; all results equal the batch's to the
-    rounding of single precision. Others, and goals that are poses, step the batch in torch.
+    It steps in NumPy on the CPU (``NumpyStepper``), several times as fast as the batch; all results
+    equal the batch's to the rounding of single precision.
 
     Attributes:
         batch: The batch of one environment.
@@ -225,9 +215,8 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
             torch.nonzero(self.batch.action_mask[0])[:, 0].tolist()
         )
         self.action_joints = tuple(robot_links[link - 1].name for link in self.action_links)
-        self._was_reset = self._next_has_begun = False
-        is_numpy = steps_in_numpy(batch)
-        self._stepper = NumpyStepper(batch, self._without_padding) if is_numpy else None
+        self._was_reset = False
+        self._stepper = NumpyStepper(batch, self._without_padding)
         first = self._without_padding(self.batch.observe())
         self.observation_space = cast(
             "gym.Space[NumpyObservation]",
@@ -245,14 +234,9 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         if seed is None and not self._was_reset:
             seed = int(self.np_random.integers(2**63))  # Gymnasium: the first reset is random
         self._running = False
-        next_has_begun = self._next_has_begun and seed is None
-        observation = self._without_padding(
-            self.batch.observe() if next_has_begun else self.batch.reset(seed)
-        )
-        if self._stepper is not None:
-            self._stepper.begin(observation)
+        observation = self._without_padding(self.batch.reset(seed))
+        self._stepper.begin(observation)
         self._running = self._was_reset = True
-        self._next_has_begun, self._final_states = False, {}
         return observation, {"self_collision": self._self_collision}
 
     def step(self, action: NDArray[Any]) -> EnvStep:
@@ -262,8 +246,7 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         if action.shape != expected:
             joints = ", ".join(self.action_joints)
             raise TaskError(f"the action has shape {action.shape}; expected {expected}: {joints}")
-        step = self._torch_step if self._stepper is None else self._stepper.step
-        observation, reward, terminated, truncated, info = step(action)
+        observation, reward, terminated, truncated, info = self._stepper.step(action)
         self._running = not (terminated or truncated)
         info["self_collision"] = self._self_collision
         return observation, reward, terminated, truncated, info
@@ -277,17 +260,6 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         """Free everything; a second call does nothing."""
         self.closed = True
         self._free()
-
-    def _torch_step(self, action: NDArray[Any]) -> EnvStep:
-        """Step the batch, which begins the next episode where one ends."""
-        actions = torch.zeros(self.batch.action_mask.shape, dtype=torch.from_numpy(action).dtype)
-        actions[0, list(self.action_links)] = torch.from_numpy(action)
-        step = self._step_batch(actions, None, keeps_ends=True)
-        if step.terminated[0] or step.truncated[0]:
-            self._next_has_begun = True
-        observation, ended = self._without_padding(step.final_observation), bool(step.terminated)
-        info = _info(step, bool(step.diverged))
-        return observation, float(step.reward), ended, bool(step.truncated), info
 
     def _without_padding(self, observation: Observation) -> NumpyObservation:
         """Return the observation of a batch of one without padding, masks and foreign fields."""

@@ -7,7 +7,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -26,8 +25,6 @@ class SB3Vector(VecEnv):
     """
 
     def __init__(self, vector: TaskVector) -> None:
-        if vector.autoreset_mode is not AutoresetMode.SAME_STEP:
-            raise TaskError("stable-baselines3 needs a vector with autoreset_mode SAME_STEP")
         self.vector = vector
         self._actions: NDArray[Any] = np.zeros(0)
         self.render_mode = vector.render_mode

@@ -23,7 +23,7 @@ from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.observation import Observation, ObservationConfig
 from morphgen.tasks.registry import KINEMATIC_CHANNELS, TASKS, register_gym_envs
-from morphgen.tasks.renderer import SIZE, Frame, Renderer, RenderState, render_state
+from morphgen.tasks.renderer import SIZE, Frame, Renderer, render_state
 from morphgen.tasks.scenes.env_specs import task_configs
 from morphgen.tasks.scenes.make import BatchOptions, make_batch
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
@@ -171,7 +171,6 @@ class BatchEnv:
         self.batch, self.max_episode_steps = batch, int(batch.max_episode_steps.max())
         self._size, self.render_mode = render_arguments(render_mode, size), render_mode
         self._renderers: dict[int, Renderer] = {}
-        self._final_states: dict[int, RenderState] = {}
         self._spec: EnvSpec | None = None
         self._running = False
 
@@ -200,7 +199,7 @@ class BatchEnv:
             raise TaskError("no episode is running; call reset()")
 
     def _frames(self) -> tuple[Frame, ...] | None:
-        """Return a picture of each environment, at the end of its episode where one has ended."""
+        """Return a picture of each environment."""
         self._require_open()
         if self.render_mode is None:
             gym.logger.warn(
@@ -211,28 +210,8 @@ class BatchEnv:
         for env, robot in enumerate(self.batch.env_robot_index.tolist()):
             if robot not in self._renderers:
                 self._renderers[robot] = Renderer.of_spec(self.batch.specs[robot], self._size)
-            state = self._final_states.get(env) or render_state(self.batch, env)
-            frames.append(self._renderers[robot].frame(state))
+            frames.append(self._renderers[robot].frame(render_state(self.batch, env)))
         return tuple(frames)
-
-    def _step_batch(
-        self, actions: torch.Tensor, hold: torch.Tensor | None, *, keeps_ends: bool
-    ) -> Step:
-        """Step the batch, which begins the next episode where one ends; keep the end to show it."""
-        is_shown = self.render_mode is not None and keeps_ends
-        count = self.batch.num_envs if is_shown else 0
-        before = [render_state(self.batch, env) for env in range(count)]
-        step = self.batch.step(actions, hold)
-        self._final_states = {
-            env: replace(
-                state,
-                q=step.q[env, : len(state.q)].cpu().numpy(),
-                block=None if state.block is None else step.object_pose[env].cpu().numpy(),
-            )
-            for env, state in enumerate(before)
-            if step.terminated[env] or step.truncated[env]
-        }
-        return step
 
     def _free(self) -> None:
         self.batch.close()
@@ -248,19 +227,16 @@ class TaskVector(BatchEnv, VectorEnv[NumpyObservation, Array, Array]):
     link whose joint the task controls in any of the robots, (n, K), of which those count that
     ``observation["actions"]`` marks: all robots of a batch share this one space.
 
-    With ``AutoresetMode.SAME_STEP`` the next episode begins in the step in which one ends:
+    The next episode begins in the step in which one ends (``AutoresetMode.SAME_STEP``):
     ``infos["final_obs"]`` is then an array of observations, with None where no episode ended, and
-    ``infos["final_info"]`` has the infos of the last step. With ``NEXT_STEP`` the last observation
-    of an episode is returned, and the next step ignores the action there, returns the first
-    observation of the next episode, and a reward of 0.
+    ``infos["final_info"]`` has the infos of the last step.
 
     Every step has ``success``, which is also ``is_success``, ``distance``, ``score``, ``diverged``,
     ``terms`` and, for goals that are poses, ``angle`` (see ``Step``), each with its mask, such as
     ``_success``: the environments whose episode goes on, or in ``final_info`` those whose episode
-    ended; with ``NEXT_STEP`` all that have acted.
+    ended.
 
     Attributes:
-        autoreset_mode: When the next episode begins.
         action_links: Links whose joints the entries of an action move, K indices below L.
     """
 
@@ -270,16 +246,12 @@ class TaskVector(BatchEnv, VectorEnv[NumpyObservation, Array, Array]):
         self,
         batch: TaskBatch,
         *,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         render_mode: str | None = None,
         size: tuple[int, int] = SIZE,
     ) -> None:
         """Wrap a batch; pictures have a width and a height [pixels]."""
         self._wrap(batch, render_mode, size)
         self.num_envs = batch.num_envs
-        self.autoreset_mode = _autoreset_mode(autoreset_mode)
-        self.metadata = type(self).metadata | {"autoreset_mode": self.autoreset_mode}
-        self._ended = np.zeros(self.num_envs, dtype=np.bool_)
         has_action, is_link = batch.action_mask.any(dim=0), batch.observe()["links"].any(dim=0)
         self.action_links: tuple[int, ...] = tuple(torch.nonzero(has_action)[:, 0].tolist())
         links = slice(int(torch.nonzero(is_link).max()) + 1)
@@ -314,28 +286,15 @@ class TaskVector(BatchEnv, VectorEnv[NumpyObservation, Array, Array]):
             seeds = whole_number("seed", seed, TaskError)
         self._running = False
         observation = self._numpy(self.batch.reset(seeds))
-        self._running, self._final_states = True, {}
-        self._ended[:] = False
+        self._running = True
         return observation, {}
 
     def step(self, actions: Array) -> tuple[NumpyObservation, Array, Array, Array, dict[str, Any]]:
         """Act for one control step."""
         self._require_running()
-        held = torch.from_numpy(self._ended.copy()) if self._ended.any() else None
-        hold = None if held is None else held.to(self.batch.device)
-        keeps_ends = self.autoreset_mode is AutoresetMode.NEXT_STEP
-        step = self._step_batch(self._padded(actions), hold, keeps_ends=keeps_ends)
+        step = self.batch.step(self._padded(actions))
         terminated, truncated = _numpy(step.terminated), _numpy(step.truncated)
         over = terminated | truncated
-        reward = _numpy(step.reward)
-        if keeps_ends:
-            acted, self._ended = ~self._ended, over
-            observation = self._numpy(step.observation)
-            if over.any():
-                last = self._numpy(step.final_observation)
-                for name, values in observation.items():
-                    values[over] = last[name][over]
-            return observation, reward, terminated, truncated, _infos(step, acted)
         infos = _infos(step, ~over)
         if over.any():
             final = np.full(self.num_envs, None, dtype=object)
@@ -344,13 +303,11 @@ class TaskVector(BatchEnv, VectorEnv[NumpyObservation, Array, Array]):
                 final[env] = {name: values[env].copy() for name, values in rows.items()}
             infos |= {"final_obs": final, "_final_obs": over.copy()}
             infos |= {"final_info": _infos(step, over), "_final_info": over.copy()}
-        return self._numpy(step.observation), reward, terminated, truncated, infos
+        observation, reward = self._numpy(step.observation), _numpy(step.reward)
+        return observation, reward, terminated, truncated, infos
 
     def render(self) -> tuple[Frame, ...] | None:
-        """Return a picture of each environment if ``render_mode`` is ``rgb_array``.
-
-        With ``NEXT_STEP`` an environment whose episode has ended shows its end.
-        """
+        """Return a picture of each environment if ``render_mode`` is ``rgb_array``."""
         return self._frames()
 
     def close_extras(self, **kwargs: object) -> None:
@@ -385,7 +342,6 @@ def task_vector(
     robots: Sequence[RobotLike] = (),
     config: TaskConfig | Mapping[str, Any] | None = None,
     max_episode_steps: int | None = None,
-    autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     render_mode: str | None = None,
     size: tuple[int, int] = SIZE,
     **options: Any,  # noqa: ANN401
@@ -394,7 +350,6 @@ def task_vector(
     options = batch_options("vector environments", task, config, options, OPTIONS)
     if options.get("seed") is None:
         options["seed"] = int(np.random.default_rng().integers(2**63))
-    autoreset_mode = _autoreset_mode(autoreset_mode)
     render_arguments(render_mode, size)
     batch = make_batch(task, robots or [robot], num_envs, **options)
     try:
@@ -402,18 +357,10 @@ def task_vector(
             require_limit(max_episode_steps, int(batch.max_episode_steps.max()))
             whole_number("max_episode_steps", max_episode_steps, TaskError, 1)
             batch.max_episode_steps.clamp_(max=max_episode_steps)
-        return TaskVector(batch, autoreset_mode=autoreset_mode, render_mode=render_mode, size=size)
+        return TaskVector(batch, render_mode=render_mode, size=size)
     except TaskError:
         batch.close()
         raise
-
-
-def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
-    """Return a mode of ``TaskVector``."""
-    for known in (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP):
-        if mode in (known, known.value):
-            return known
-    raise TaskError(f"autoreset_mode {mode}: expected SAME_STEP or NEXT_STEP")
 
 
 def _infos(step: Step, where: Array) -> dict[str, Any]:

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from morphgen.model.kinematics_torch import angle_between, matrix_from_quaternion
+from morphgen.model.kinematics_torch import matrix_from_quaternion
 from morphgen.tasks.configs import ReachConfig
 from morphgen.tasks.random_numbers import EpisodeRandom, Stream
-from morphgen.tasks.rows import GoalChoices, choose, padded_rows, row_norms
+from morphgen.tasks.rows import GoalChoices, angles_between, choose, padded_rows, row_norms
 from morphgen.tasks.task import A, EnvSpec, StepFormulas, StepResult, TaskEnvs, TaskState
 
 
@@ -26,9 +26,8 @@ class ReachFormulas(StepFormulas[A]):
     def evaluate(self, state: TaskState[A]) -> StepResult[A]:
         """Compare the tools with their goals."""
         angle, config = None, self._config
-        tool, goal = state.tool_rotation, self._goal_rotation
-        if isinstance(tool, torch.Tensor) and isinstance(goal, torch.Tensor):
-            angle = angle_between(tool, goal)  # such goals are evaluated in torch alone
+        if state.tool_rotation is not None and self._goal_rotation is not None:
+            angle = angles_between(state.tool_rotation, self._goal_rotation)
         distance = row_norms(state.tool - self._goal[..., :3])
         return StepResult(
             success=is_near(config, distance, angle) & ~state.diverged,

@@ -292,11 +292,11 @@ class HoverConfig(ReachConfig):
     num_goals: int = 3
 
 
-class HoverEnvs(ReachEnvs):
-    """Environments of reach with another field."""
+class HoverFormulas(ReachFormulas):
+    """Formulas of reach with another field."""
 
     def observe(self, object_pose):
-        return {**super().observe(object_pose), "extra": self.goal[:, :1]}
+        return {**super().observe(object_pose), "extra": self._goal[..., :1]}
 
 
 @pytest.fixture
@@ -304,8 +304,19 @@ def make(monkeypatch, tmp_path):
     """Return a function that makes two environments of a task with changed parts, and steps."""
     monkeypatch.setattr(TASKS, "_loaded", dict(TASKS._loaded))
 
-    def step(fields=(GOAL, EXTRA), made=None, make_envs=True, sample=Reach.sample, **methods):
-        envs = type("Envs", (HoverEnvs,), methods)
+    def step(
+        fields=(GOAL, EXTRA),
+        made=None,
+        make_envs=True,
+        sample=Reach.sample,
+        begin=ReachEnvs.begin,
+        **methods,
+    ):
+        def envs(*args):
+            made = type("Envs", (ReachEnvs,), {"begin": begin})(*args)
+            made.formulas.__class__ = type("Formulas", (HoverFormulas,), methods)
+            return made
+
         parts = {"name": "hover", "config_type": HoverConfig, "fields": fields, "sample": sample}
         parts["make_envs"] = lambda self, *args: made or (envs(*args) if make_envs else None)
         TASKS.register(type("Hover", (Reach,), parts)())
@@ -320,7 +331,7 @@ def changed(**changes):
     """Return ``evaluate`` with parts of the result changed by functions of them."""
 
     def evaluate(self, state):
-        result = HoverEnvs.evaluate(self, state)
+        result = ReachFormulas.evaluate(self, state)
         return replace(result, **{key: new(getattr(result, key)) for key, new in changes.items()})
 
     return {"evaluate": evaluate}
@@ -353,7 +364,7 @@ def test_a_sound_task_is_stepped(make):
         (changed(terms=lambda terms: {"a": 1.0}), "the reward term 'a': float; expected a tensor"),
         (changed(success=torch.Tensor.float), "success is torch.float32; expected bool"),
         (changed(distance=torch.Tensor.bool), "distance is torch.bool; expected numbers"),
-        ({"observe": ReachEnvs.observe}, "observe: the field 'extra' is missing"),
+        ({"observe": ReachFormulas.observe}, "observe: the field 'extra' is missing"),
         ({"fields": (GOAL,)}, "observe: 'extra' is no ObservationField in the task's `fields`"),
         (
             {"fields": (GOAL, replace(EXTRA, size=2))},
@@ -393,18 +404,10 @@ def test_an_incomplete_task_is_not_registered(monkeypatch, parts, message):
     assert parts["name"] not in TASKS
 
 
-@pytest.mark.parametrize(
-    ("parts", "message"),
-    [
-        ({}, "Bare has no evaluate and no observe; expected these methods, or `formulas`"),
-        ({"evaluate": print}, "Bare has no observe; expected this method, or"),
-        ({"observe": print}, "Bare has no evaluate; expected this method, or"),
-        ({"formulas": None}, "Bare has no evaluate and no observe"),
-    ],
-)
-def test_environments_without_formulas_need_methods(make, parts, message):
-    bare = type("Bare", (TaskEnvs,), {"begin": HoverEnvs.begin, **parts})
-    with pytest.raises(TaskError, match=f"task 'hover': {message}"):
+@pytest.mark.parametrize("parts", [{}, {"formulas": None}])
+def test_environments_need_formulas(make, parts):
+    bare = type("Bare", (TaskEnvs,), {"begin": ReachEnvs.begin, **parts})
+    with pytest.raises(TaskError, match="task 'hover': Bare has no `formulas`; expected StepForm"):
         make(made=bare())
 
 

@@ -494,7 +494,6 @@ def test_points_lie_on_the_box_at_the_contact_point(task, make):
 def test_gymnasium_makes_the_environment(task, cache):
     name = f"morphgen.tasks.gym.env:morphgen/{task.capitalize()}-v0"
     made = gym.make(name, robot=ROBOT, config=CONFIGS[task], cache=cache)
-    assert made.unwrapped._stepper is not None  # steps in NumPy: see test_numpy_step.py
     seen, _ = made.reset(seed=0)
     assert seen.keys() >= {"tokens", "object", "object_base", "object_joint"}
     assert not seen.keys() & {"goal", "line", "joint_mask"}

@@ -1,4 +1,4 @@
-"""Single environments in NumPy: everything equals the batch's, or the batch steps in torch."""
+"""Single environments in NumPy: everything equals the batch's."""
 
 import math
 from dataclasses import replace
@@ -11,9 +11,8 @@ from helpers.simulators import needs_pybullet
 from morphgen.tasks import make_batch
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.configs import PushConfig, ReachConfig
-from morphgen.tasks.gym.env import TaskEnv, steps_in_numpy
+from morphgen.tasks.gym.env import TaskEnv
 from morphgen.tasks.observation import ObservationConfig
-from morphgen.tasks.reach.envs import ReachEnvs
 from morphgen.tasks.registry import TASKS
 
 ROUNDING = 1e-5
@@ -76,6 +75,8 @@ def assert_step_equals(result, env, step):
     for name, term in info["terms"].items():
         assert term == pytest.approx(float(step.terms[name][0]), rel=1e-5, abs=1e-5), name
     assert ("angle" in info) == (step.angle is not None)
+    if step.angle is not None:
+        assert info["angle"] == pytest.approx(float(step.angle[0]), rel=1e-5, abs=1e-5)
 
 
 def run_both(env, batch, episodes, seed=2):
@@ -119,7 +120,6 @@ POSE = ReachConfig(max_episode_steps=STEPS, num_goals=5, goal="pose")
 def test_steps_equal_those_of_the_batch(make, task, sim, kind):
     obstacles = sim != "kinematic" and kind == "discrete" and task not in OBJECTS
     env, batch = make(task, sim=sim, kind=kind, obstacles=obstacles)
-    assert env._stepper is not None
     ends, successes = run_both(env, batch, 4)
     if task == "reach":
         assert ends == [False] * 4
@@ -127,18 +127,17 @@ def test_steps_equal_those_of_the_batch(make, task, sim, kind):
 
 
 @pytest.mark.parametrize(
-    ("task", "options", "in_numpy"),
+    ("task", "options"),
     [
-        ("reach", {"robot": "arm=jaco2 ee=stick"}, True),  # joints without limits
-        ("reach", {"robot": "planar-cube"}, True),  # slides
-        ("reach", {"config": POSE}, False),
-        ("reach", {"observe": VELOCITY}, True),
-        ("push", {"observe": ObservationConfig(points=5, state=False), "obstacles": True}, True),
+        ("reach", {"robot": "arm=jaco2 ee=stick"}),  # joints without limits
+        ("reach", {"robot": "planar-cube"}),  # slides
+        ("reach", {"config": POSE}),
+        ("reach", {"observe": VELOCITY}),
+        ("push", {"observe": ObservationConfig(points=5, state=False), "obstacles": True}),
     ],
 )
-def test_other_environments_equal_the_batch(make, task, options, in_numpy):
+def test_other_environments_equal_the_batch(make, task, options):
     env, batch = make(task, **options)
-    assert (env._stepper is not None) is in_numpy
     run_both(env, batch, 2)
     assert task == "reach" or not env.reset()[0]["object"].any()
 
@@ -172,12 +171,8 @@ def test_curriculum_moves_the_line_within_an_episode(make):
 
 
 @pytest.mark.parametrize("task", ["reach", "push", "door"])
-@pytest.mark.parametrize("in_numpy", [True, False])
-def test_all_channels_equal_those_of_the_batch(make, task, in_numpy):
-    env, batch = make(task, observe=CHANNELS, obstacles=task not in OBJECTS)
-    if not in_numpy:
-        env._stepper = None
-    run_both(env, batch, 1)
+def test_all_channels_equal_those_of_the_batch(make, task):
+    run_both(*make(task, observe=CHANNELS, obstacles=task not in OBJECTS), 1)
 
 
 def test_divergence_is_undone_as_in_the_batch(make):
@@ -197,17 +192,6 @@ def test_divergence_is_undone_as_in_the_batch(make):
     assert result[3]
     assert torch.equal(env.batch.q, before)
     assert_observation_equals(env.reset()[0], env, step.observation)
-
-
-def test_classes_that_change_a_step_in_torch_step_in_torch(make):
-    class Changed(ReachEnvs):
-        def evaluate(self, state):
-            return super().evaluate(state)
-
-    env, _ = make("reach")
-    for cls, in_numpy in ((Changed, False), (ReachEnvs, True)):
-        env.batch.groups["reach"].__class__ = cls
-        assert steps_in_numpy(env.batch) is in_numpy
 
 
 def test_observations_are_the_callers(make):
