@@ -349,8 +349,8 @@ def _population(browser: Any, folder: Path, robots: int, moves: int) -> list[Row
 def _serve(told: Path) -> None:
     """Serve until interrupted, then write the time of every move [ms]."""
     from morphgen.viewer.app.app import serve
-    from morphgen.viewer.pages.population import PopulationScene
     from morphgen.viewer.pages.robot import RobotPage
+    from morphgen.viewer.scene.population import PopulationScene
 
     times: dict[str, list[float]] = {"robot": [], "population": []}
 

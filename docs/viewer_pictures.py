@@ -29,7 +29,7 @@ PAGES = {
     "population": ("?population=robots/arm3&arrange=reach&select=0-40", "text=41 selected"),
     "robot": (
         "?robot=words:arm=panda ee=panda_hand&show=x-ray,frames,joint axes,names&tab=Show",
-        "text=centres of mass",
+        "text=joint axes",
     ),
     "compose": (
         "?compose=base=pedestal left.arm=ur5 left.ee=robotiq_2f85 right.arm=xarm7 "

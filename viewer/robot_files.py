@@ -1,4 +1,4 @@
-"""Files made from robots: thumbnails with the facts of a gallery, and bundles to download."""
+"""Files made from robots: thumbnails with facts of a gallery, bundles, web pages, turntables."""
 
 from __future__ import annotations
 
@@ -7,27 +7,36 @@ import io
 import json
 import re
 import tempfile
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from html import escape
 from pathlib import Path
 
+import numpy as np
+import viser
 from PIL import Image
 from platformdirs import user_cache_path
+from viser.infra import StateSerializer
 
 from morphgen.benchmark.survey import robot_stats
 from morphgen.checks import check
 from morphgen.errors import MorphgenError
 from morphgen.files import write_cache_file
-from morphgen.formats.bundle import CARD, MJCF, write_bundle
+from morphgen.formats.bundle import CARD, MJCF, split_colours, write_bundle
 from morphgen.formats.picture import render
 from morphgen.formats.zip_files import write_entries
+from morphgen.model.kinematics import joint_limits
 from morphgen.model.robot import Robot
 from morphgen.model.scene_files import read_picture
+from morphgen.typing import Array
 from morphgen.viewer.app.address import AddressError
+from morphgen.viewer.app.server import AccessPolicy, start_server, stop_server
 from morphgen.viewer.app.session import Session
 from morphgen.viewer.robot_uri import FileAccess, UriError, content_hash, read_robot_uri, uri_name
+from morphgen.viewer.scene.robot import add_robot, robot_bounds
+from morphgen.viewer.scene.stage import add_ground, place_camera, set_stage
 
 SIZE = (240, 180)  # largest width and height of a thumbnail [pixels]
 _JPEG_QUALITY = 82  # JPEG quality of thumbnails, 0 to 100; tuned by eye at the size of a card
@@ -120,6 +129,119 @@ def _data_url(picture: Image.Image) -> str:
     small.thumbnail(SIZE)
     small.save(content, "JPEG", quality=_JPEG_QUALITY)
     return "data:image/jpeg;base64," + base64.b64encode(content.getvalue()).decode()
+
+
+_TITLE = re.compile(r"<title>[^<]*</title>")
+_JOINT_TIME, _HOME_TIME, _FRAME_TIME = 2.4, 1.0, 0.05
+"""Time in which a joint moves through its range, at home before the first one, and of a picture
+[s]."""
+_BOUNDED_STEPS = 8  # configurations of each joint by which the camera is framed
+_LABEL_SHARE = 0.08  # height of the room for the label, as a share of the robot's
+
+
+@contextmanager
+def scene_server() -> Iterator[viser.ViserServer]:
+    """Start a server whose scene can be recorded; having no name, it accepts no request."""
+    server = start_server("127.0.0.1", 0, AccessPolicy(names=frozenset()))
+    try:
+        yield server
+    finally:
+        stop_server(server)
+
+
+def robot_page(robot: Robot, dark: bool = False) -> bytes:
+    """Return a web page of a robot that moves its joints in turn, with slider and space bar."""
+    robot = split_colours(robot)
+    low, high = robot_bounds(robot)
+    with scene_server() as server:
+        set_stage(server.scene, dark=dark)
+        add_ground(server.scene, float(np.linalg.norm(high - low)))
+        view = add_robot(server.scene, robot, "/robot")
+        low, high = sweep_bounds(robot)
+        place_camera(server.initial_camera, low, high)
+        if not robot.dof:
+            return web_page(server.get_scene_serializer(), robot.name, dark=dark)
+        top = (float(low[0] + high[0]) / 2, float(low[1] + high[1]) / 2, float(high[2]))
+        label = server.scene.add_label("/joint", "home", position=top, anchor="top-center")
+        recording = server.get_scene_serializer()
+        recording.insert_sleep(_HOME_TIME)
+        for column, text in enumerate(joint_titles(robot)):
+            label.text = text
+            for q in joint_sweep(robot, column, round(_JOINT_TIME / _FRAME_TIME)):
+                view.set_configuration(q)
+                recording.insert_sleep(_FRAME_TIME)
+        return web_page(recording, robot.name, dark=dark)
+
+
+def joint_sweep(robot: Robot, column: int, n: int) -> Array:
+    """Return configurations (n, dof) in which a joint moves from home to both limits and back."""
+    home = np.array(robot.home, dtype=np.float64)
+    low, high = joint_limits(robot)[column]
+    stops = np.array([home[column], low, high, home[column]])
+    times = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(stops)))])
+    share = (1 - np.cos(np.pi * np.arange(1, n + 1) / n)) / 2
+    configurations = np.tile(home, (n, 1))
+    configurations[:, column] = np.interp(share * times[-1], times, stops)
+    return configurations
+
+
+def sweep_bounds(robot: Robot) -> tuple[Array, Array]:
+    """Return the corners of a robot while its joints move as the page shows, and of its label."""
+    sweeps = [joint_sweep(robot, column, _BOUNDED_STEPS) for column in range(robot.dof)]
+    configurations = np.concatenate([np.array(robot.home, dtype=np.float64)[None], *sweeps])
+    lows, highs = zip(*(robot_bounds(robot, q) for q in configurations), strict=True)
+    low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+    high[2] += _LABEL_SHARE * (high[2] - low[2])
+    return low, high
+
+
+def joint_titles(robot: Robot) -> list[str]:
+    """Return the number, name and range of each independent joint."""
+    titles = []
+    for column, (low, high) in enumerate(joint_limits(robot)):
+        joint = robot.joints[robot.independent_joints[column]]
+        is_angle = joint.kind != "prismatic"
+        ends = np.degrees((low, high)) if is_angle else np.array((low, high))
+        limits = f"{ends[0]:.3g} to {ends[1]:.3g} {'deg' if is_angle else 'm'}"
+        titles.append(f"joint {column + 1} of {robot.dof}, {joint.name}: {limits}")
+    return titles
+
+
+def web_page(recording: StateSerializer, title: str, *, dark: bool) -> bytes:
+    """Return a recorded scene as a web page."""
+    html, count = _TITLE.subn(f"<title>{escape(title)}</title>", recording.as_html(dark), count=1)
+    if count != 1:
+        raise RuntimeError("this version of viser has another page; see viewer/robot_files.py")
+    return html.encode()
+
+
+NUM_FRAMES, FPS = 72, 18  # frames of a turn, and frames per second: a turn takes four seconds
+_RING_POINTS = 24
+
+
+def turntable(robot: Robot, suffix: str) -> bytes:
+    """Return a video of a robot at home that turns once around the vertical."""
+    # PyTorch and the video encoder take seconds to load, for which web pages need not wait.
+    from morphgen.tasks.renderer import SIZE, Renderer, RenderState, write_video
+    from morphgen.tasks.sim.base import Scene
+
+    home = np.array([robot.home], dtype=np.float64)
+    renderer = Renderer(Scene(robot), (), home, _ring(robot), SIZE)
+    state = RenderState(home[0].astype(np.float32))
+    frames = (renderer.frame(state, 360 * i / NUM_FRAMES) for i in range(NUM_FRAMES))
+    with closing(renderer), tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"film{suffix}"
+        write_video(frames, path, FPS)
+        return path.read_bytes()
+
+
+def _ring(robot: Robot) -> Array:
+    """Return points on the cylinder that a robot's bounding box fills as it turns, (n, 3) [m]."""
+    low, high = robot_bounds(robot)
+    middle, radius = (low + high) / 2, float(np.linalg.norm((high - low)[:2])) / 2
+    angles = np.linspace(0, 2 * np.pi, _RING_POINTS, endpoint=False)
+    circle = middle[:2] + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return np.concatenate([np.insert(circle, 2, z, axis=1) for z in (max(low[2], 0.0), high[2])])
 
 
 MAX_EXPORT = 200 * 2**20  # largest export before compression [bytes]

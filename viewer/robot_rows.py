@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,8 +24,7 @@ from morphgen.viewer import robot_uri
 
 T = TypeVar("T")
 
-PAGE_SIZES = (24, 48, 96)
-SORTS = ("order", "name", "category", "dof", "links", "reach", "mass", "role", "findings")
+SORTS = ("order", "name", "dof", "links", "reach", "mass")
 """Keys by which rows can be sorted; ``order`` is the order of the set."""
 UNITS = {"reach": "m", "mass": "kg", "dof": "DoF", "links": "links"}
 """Facts that are numbers, and their units."""
@@ -85,15 +85,10 @@ def passes(row: Row, state: Mapping[str, str]) -> bool:
 def sort_rows(rows: Iterable[Row], key: str) -> list[Row]:
     """Sort rows by a fact, or descending by ``-fact``; unknown last, ties in the set's order."""
     name = key.removeprefix("-")
-
-    def value(row: Row) -> Any:  # noqa: ANN401
-        fact = getattr(row, name)
-        return len(fact) if name == "findings" and fact is not None else fact
-
     rows = sorted(rows, key=lambda row: row.order)
-    rows_with_fact = [row for row in rows if value(row) is not None]
-    rows_without = [row for row in rows if value(row) is None]
-    return [*sorted(rows_with_fact, key=value, reverse=key.startswith("-")), *rows_without]
+    known = [row for row in rows if getattr(row, name) is not None]
+    unknown = [row for row in rows if getattr(row, name) is None]
+    return [*sorted(known, key=attrgetter(name), reverse=key.startswith("-")), *unknown]
 
 
 def select_page(rows: Sequence[T], number: int, size: int) -> tuple[list[T], int, int]:

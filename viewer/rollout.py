@@ -1,4 +1,4 @@
-"""Playback of episodes: their sources, and the player that shows them in one browser."""
+"""Episodes, their sources, and the player that shows them in one browser."""
 
 from __future__ import annotations
 
@@ -9,14 +9,102 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import CancelledError, Future
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from morphgen.errors import MorphgenError, TaskError, nearest
+from morphgen.model.robot import Robot
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.sim.articulated import ArticulatedObject
+from morphgen.tasks.sim.base import Block
+from morphgen.tasks.task import Marker
 from morphgen.viewer.app.workers import Workers, named
-from morphgen.viewer.episode import Episode
 from morphgen.viewer.robot_uri import CHECKPOINT, FileAccess, UriError, shorten
+
+Array = NDArray[np.float32]
+
+BLOCK = "block"  # name of the block, or of the articulated object, among the poses of a track
+_OF_STEPS = ("score", "distance", "success")  # values of a track that every step has
+
+
+@dataclass(eq=False)
+class Track:
+    """Motion and scores of one robot; it grows while its episode is simulated."""
+
+    robot: Robot
+    uri: str
+    ground: float | None  # height of the ground [m]; None without ground
+    obstacles: tuple[Block, ...] = ()
+    markers: tuple[Marker, ...] = ()  # shapes that show the goal
+    block_size: tuple[float, float, float] | None = None
+    object: ArticulatedObject | None = None
+    q: list[Array] = field(default_factory=list)  # positions (J,) at the start and every step
+    poses: dict[str, list[Array]] = field(default_factory=dict)
+    """Poses in the world at the same times, (x, y, z, qw, qx, qy, qz): of each marker by its name,
+    and of ``block`` if any, or of the object's contact point and the link that moves."""
+    score: list[float] = field(default_factory=list)
+    distance: list[float] = field(default_factory=list)  # to success [m]
+    success: list[bool] = field(default_factory=list)
+    reward: list[float] = field(default_factory=list)  # of demonstrations, which have them
+    fault: str = ""  # error that ended the episode early; empty without error
+
+    @property
+    def num_steps(self) -> int:
+        """Control steps so far."""
+        return len(self.q) - 1
+
+    def recorded(self, after: int = -1) -> dict[str, Any]:
+        """Return copies of the lists after a number of steps, by default with the start."""
+        last = min(self.num_steps, len(self.score))
+        moments, steps = slice(after + 1, last + 1), slice(max(after, 0), last)
+        lists: dict[str, Any] = {"q": self.q[moments]}
+        lists["poses"] = {name: poses[moments] for name, poses in self.poses.items()}
+        return lists | {name: getattr(self, name)[steps] for name in _OF_STEPS}
+
+    def extend(self, lists: Mapping[str, Any]) -> None:
+        """Append what ``recorded`` of the same robot has returned."""
+        for name, poses in lists["poses"].items():
+            self.poses[name] += poses
+        # Last, because other threads read a track up to the length of q meanwhile.
+        for name in (*_OF_STEPS, "q"):
+            getattr(self, name).extend(lists[name])
+
+
+@dataclass(eq=False)
+class Episode:
+    """Robots at the same task under the same policy."""
+
+    task: str
+    policy: str
+    seed: int
+    obstacles: bool  # whether obstacles were requested
+    simulator: str
+    period: float  # time of a control step [s]
+    tracks: list[Track]
+
+    @property
+    def num_steps(self) -> int:
+        """Control steps so far of the longest track."""
+        return max((track.num_steps for track in self.tracks), default=0)
+
+
+def score_until(track: Track, task: str, step: int) -> float | None:
+    """Return an episode's score as if it had ended at a step of its track; None at the start."""
+    scores = track.score[:step]
+    if not scores:
+        return None
+    return TASKS[task].episode_score(sum(scores), scores[-1], len(scores))
+
+
+def snapshot(episode: Episode) -> Episode:
+    """Return a copy of an episode that does not grow while the simulation continues."""
+    tracks = [replace(track, **track.recorded()) for track in episode.tracks]
+    return replace(episode, tracks=tracks)
+
 
 MAX_CHECKPOINTS = 50  # checkpoints that a page offers
 
@@ -103,7 +191,6 @@ def list_checkpoints(files: FileAccess) -> list[str]:
     return [path.relative_to(root).as_posix() for path in paths[:MAX_CHECKPOINTS]]
 
 
-SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)  # speeds of playback [simulated seconds per second]
 FRAME_TIME = 0.04  # time between two frames in a browser: 25 per second [s]
 MAX_SIMULATION_TIME = 0.12  # longest time until commands are handled [s]
 
@@ -134,7 +221,6 @@ class Player:
         self.is_playing, self.step = False, 0
         self._display = display
         self._source: EpisodeSource | None = None
-        self._speed = 1.0
         self._clock_start, self._step_start = 0.0, 0.0
         self._commands: dict[str, Callable[[], object]] = {}
         self._counter = itertools.count()
@@ -185,15 +271,6 @@ class Player:
         # Each press of a button counts, so each command has a key of its own.
         key = f"by {next(self._counter)}"
         self._command(key, lambda: self._simulate_to(self.step + num_steps))
-
-    def set_speed(self, speed: float) -> None:
-        """Set the speed of playback [simulated seconds per second]."""
-
-        def change() -> None:
-            self._speed = speed
-            self._restart_clock()
-
-        self._command("speed", change)
 
     def stop(self) -> None:
         """End the thread after its current work."""
@@ -276,8 +353,7 @@ class Player:
         if source is None or not self.is_playing:
             return
         now = time.monotonic()
-        elapsed = (now - self._clock_start) * self._speed
-        due = int(self._step_start + elapsed / source.episode.period)
+        due = int(self._step_start + (now - self._clock_start) / source.episode.period)
         is_running, deadline = True, now + MAX_SIMULATION_TIME
         while is_running and source.episode.num_steps < due and time.monotonic() < deadline:
             is_running = source.advance()

@@ -38,7 +38,6 @@ from morphgen.tasks.scenes.env_specs import load_robot
 from morphgen.tasks.sim.articulated import ArticulatedObject
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Block
 from morphgen.viewer.app.address import MAX_PLAYED
-from morphgen.viewer.episode import BLOCK, Array, Episode, Track
 from morphgen.viewer.robot_uri import (
     DEFAULT_WORDS,
     DERIVATION,
@@ -48,7 +47,15 @@ from morphgen.viewer.robot_uri import (
     read_robot_uri,
     with_library_meshes,
 )
-from morphgen.viewer.rollout import EpisodeSource, RolloutConfig, checkpoint_path
+from morphgen.viewer.rollout import (
+    BLOCK,
+    Array,
+    Episode,
+    EpisodeSource,
+    RolloutConfig,
+    Track,
+    checkpoint_path,
+)
 
 
 @dataclass(eq=False)

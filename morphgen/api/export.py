@@ -152,13 +152,13 @@ def _target(source: RobotReference | None, robot: Robot, given: SimpleNamespace)
 
 
 def _html(robot: Robot, given: SimpleNamespace) -> bytes:
-    from morphgen.viewer.app.web_page import robot_page  # of an extra, and seconds to import
+    from morphgen.viewer.robot_files import robot_page  # of an extra, and seconds to import
 
     return robot_page(robot, dark=given.dark)
 
 
 def _video(robot: Robot, given: SimpleNamespace) -> bytes:
-    from morphgen.viewer.film import turntable  # of an extra, and seconds to import
+    from morphgen.viewer.robot_files import turntable  # of an extra, and seconds to import
 
     return turntable(robot, f".{given.format}")
 

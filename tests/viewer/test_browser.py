@@ -116,12 +116,6 @@ def players():
     return [each for each in threading.enumerate() if each.name == "morphgen-player"]
 
 
-def download(page, button):
-    with page.expect_download() as found:
-        page.get_by_role("button", name=button).click()
-    return found.value
-
-
 def test_url_is_shown_and_new_episodes_have_other_seeds(see, viewer):
     page = see(f"?play=reach&robot={CUBE}&policy=random")
     page.wait_for_url(re.compile(r"policy=random$"))
@@ -133,16 +127,6 @@ def test_url_is_shown_and_new_episodes_have_other_seeds(see, viewer):
     page.wait_for_url(re.compile(r"policy=ik&seed=1"))
     wait_for_end(page)
     page.get_by_text("success", exact=True).wait_for()
-
-
-def test_episode_is_saved_as_a_film(see, viewer):
-    page = see(f"?play=reach&robot={CUBE}&robot=words:base=gantry ee=cube&policy=ik&seed=1")
-    wait_for_end(page)
-    film = download(page, "Film (.mp4)")
-    assert film.suggested_filename == "reach-planar-cube-1.mp4"
-    assert film.path().read_bytes()[4:8] == b"ftyp"
-    assert page.get_by_text("success", exact=True).count() == 2
-    assert page.failures == []
 
 
 def test_robots_are_replaced_added_and_removed(see, viewer):

@@ -15,10 +15,9 @@ from morphgen.grammar.library import default_library
 from morphgen.rl.demonstrations.reader import at_links
 from morphgen.viewer.app.address import Address
 from morphgen.viewer.app.app import start_address
-from morphgen.viewer.episode import score_until
 from morphgen.viewer.pages.play import curves
 from morphgen.viewer.robot_uri import FileAccess, UriError
-from morphgen.viewer.rollout import RolloutConfig
+from morphgen.viewer.rollout import RolloutConfig, score_until
 from morphgen.viewer.simulation import Rollout, list_episodes, recorded_episode
 
 pa = pytest.importorskip("pyarrow")

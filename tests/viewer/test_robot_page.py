@@ -23,13 +23,12 @@ from morphgen.grammar.library import default_library
 from morphgen.model.findings import Finding
 from morphgen.model.kinematics import frame_pose
 from morphgen.model.robot import Inertial
-from morphgen.viewer import robot_rows, robot_tables
-from morphgen.viewer.pages.robot import format_joints, joint_of_link, parse_joints
+from morphgen.viewer import markup, robot_rows
+from morphgen.viewer.markup import is_about, joint_groups, link_card, link_table
+from morphgen.viewer.pages.robot import format_joints, parse_joints
 from morphgen.viewer.robot_rows import Row, part_rows, passes, sort_rows
-from morphgen.viewer.robot_tables import is_about, joint_groups, link_card, link_table
 from morphgen.viewer.robot_uri import read_robot_uri
-from morphgen.viewer.scene import overlays as workspace
-from morphgen.viewer.scene.robot import RED
+from morphgen.viewer.scene.robot import RED, shell
 from morphgen.viewer.scene.stage import inertia_box, look_at
 
 ARM = "?robot=robots/some-arm"
@@ -154,7 +153,7 @@ def test_filters(condition, left):
 
 ORDERS = {
     **{"order": "bac", "-order": "cab", "name": "abc", "-name": "cba", "reach": "bca"},
-    **{"-reach": "cba", "mass": "abc", "-mass": "bac", "-findings": "abc"},
+    **{"-reach": "cba", "mass": "abc", "-mass": "bac"},
 }
 
 
@@ -200,9 +199,9 @@ def test_known_facts_are_joined_in_one_line():
 
 
 def test_licences_of_parts_are_shown_with_their_restrictions():
-    assert robot_tables.licence_line(arm()) == ""
+    assert markup.licence_line(arm()) == ""
     parts = [{"licence": each} for each in ("MIT", "CC-BY-NC-SA-4.0", "MIT")]
-    line = robot_tables.licence_line(replace(arm(), provenance={"parts": parts}))
+    line = markup.licence_line(replace(arm(), provenance={"parts": parts}))
     restricted = "CC-BY-NC-SA-4.0 non-commercial, share-alike"
     assert re.sub("<[^>]*>", "", line) == f"licences of its parts: MIT, {restricted}"
 
@@ -221,7 +220,7 @@ def test_joints_are_grouped_by_their_part():
 
 
 def test_slider_hint_names_joint_type_and_limits():
-    hints = [robot_tables.joint_hint(arm().joints[i]) for i in (0, 2)]
+    hints = [markup.joint_hint(arm().joints[i]) for i in (0, 2)]
     assert hints[0] == "shoulder: revolute, -2 to 2 rad, at most 50 N m, 2 rad/s"
     assert hints[1].startswith("extend: prismatic, 0 to 0.04 m, at most 20 N")
 
@@ -230,7 +229,7 @@ def test_slider_hint_names_joint_type_and_limits():
     ("low", "high", "step"), [(-3.14, 3.14, 0.01), (0, 0.04, 0.0001), (0, 0, 0.001), (-1, 1, 0.01)]
 )
 def test_slider_steps_are_round_and_small(low, high, step):
-    assert robot_tables.slider_step(low, high) == pytest.approx(step)
+    assert markup.slider_step(low, high) == pytest.approx(step)
 
 
 def test_tables_name_every_link_and_escape_it():
@@ -244,7 +243,7 @@ def test_tables_name_every_link_and_escape_it():
     assert "&lt;b&gt;" in link_table(odd)
     assert "<b>" not in link_card(odd, "<b>", ())
     assert "mimics" in link_card(robot, "right", ())
-    assert robot_tables.summary(robot, 0.9).startswith("6 links · 4 DoF · 1 mimic joint · ")
+    assert "6 links · 4 DoF · 1 mimic joint · " in markup.summary(robot, "")
 
 
 def test_configurations_are_restored_from_urls():
@@ -267,12 +266,6 @@ def test_the_box_has_the_inertia_of_the_link():
     assert np.linalg.det(axes) == pytest.approx(1)
     assert inertia_box(Inertial(0.0)) is None
     assert inertia_box(Inertial.from_matrix(1.0, (0, 0, 0), np.diag([1.0, 0.1, 0.1]))) is None
-
-
-def test_the_joint_of_a_link_is_the_nearest_above_it_or_the_one_that_it_follows():
-    robot = arm()
-    rows = [joint_of_link(robot, robot.link_index[name]) for name in ("base", "upper", "right")]
-    assert rows == [None, 0, 3]
 
 
 def test_a_card_shows_mass_limits_in_both_units_and_the_findings_of_its_link():
@@ -299,7 +292,7 @@ def test_a_finding_is_about_the_links_and_joints_that_it_names():
     assert not is_about(Finding("x", "info", "joint ", "", ""), "base", "")
 
 
-def test_a_click_selects_a_link_and_marks_its_joint(viewer):
+def test_a_click_selects_a_link(viewer):
     on = viewer()
     with PlainClient(on.port, ARM) as client:
         client.shows("no Compose: it is not made of parts")
@@ -312,7 +305,6 @@ def test_a_click_selects_a_link_and_marks_its_joint(viewer):
         client.send(click)
         client.shows("link=upper")
         client.until(lambda: "/robot/1/outline0" in view)
-        client.shows("mantine-Slider-thumb")
         client.send(click)
         client.until(lambda: "/robot/1/outline0" not in view)
 
@@ -327,7 +319,7 @@ def ball():
 
 
 def test_the_shell_encloses_the_points(ball):
-    vertices, faces = workspace.shell(ball)
+    vertices, faces = shell(ball)
     a, b, c = (vertices[faces[:, k]].astype(float) for k in range(3))
     volume = (a * np.cross(b, c)).sum() / 6
     assert volume == pytest.approx(4 / 3 * np.pi, rel=0.05)
@@ -335,7 +327,7 @@ def test_the_shell_encloses_the_points(ball):
 
 def test_toggles_draw_grown_shapes_names_boxes_and_the_workspace(viewer):
     on = viewer()
-    shown = "visual,collision,inertia,x-ray,frames,joint axes,centres of mass,names,workspace"
+    shown = "visual,collision,inertia,x-ray,frames,joint axes,names,workspace"
     with PlainClient(on.port, f"{ARM}&show={shown}") as client:
         client.shows("no self-collision")
         view = nodes(on)
@@ -347,7 +339,7 @@ def test_toggles_draw_grown_shapes_names_boxes_and_the_workspace(viewer):
         client.until(lambda: "/robot/workspace" in view)
         assert view["/robot/1/visual0"].opacity == pytest.approx(0.2)
         assert view["/robot/1/name"].text == "upper"
-        assert {"/robot/1/inertia", "/robot/1/axis", "/robot/1/com"} <= view.keys()
+        assert {"/robot/1/inertia", "/robot/1/axis"} <= view.keys()
         assert view["/robot/1"].show_axes
         assert 0.0205 < radius() < 0.03  # the cylinder has 0.02 m
         client.change(client.control("Checkbox", "visual"), False)

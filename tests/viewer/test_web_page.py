@@ -32,12 +32,13 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_request
 from morphgen.model.kinematics import joint_limits
+from morphgen.tasks import renderer
 from morphgen.tasks.renderer import Renderer, RenderState
 from morphgen.tasks.sim.base import Scene
-from morphgen.viewer import film
+from morphgen.viewer import robot_files
 from morphgen.viewer.app.address import MAX_CHOSEN, Address, parse_address
 from morphgen.viewer.app.frame import page_links, shown_address, tray_html
-from morphgen.viewer.app.web_page import joint_sweep, joint_titles, robot_page
+from morphgen.viewer.robot_files import joint_sweep, joint_titles, robot_page
 
 ADDRESS = re.compile(rb"""(?:src|href)=["'](?!data:)[^"']+["']""")
 
@@ -105,19 +106,19 @@ def test_the_ground_has_no_dark_dots_at_the_sides_of_a_picture():
     derivation = parse_request(["base=gantry", "ee=cube"], default_library())
     robot = compose(derivation, default_library(), "gantry")
     home = np.array([robot.home])
-    renderer = Renderer(Scene(robot), (), home, film._ring(robot), (480, 360))
-    frame = renderer.frame(RenderState(home[0]), 75).astype(int).sum(axis=2)
-    renderer.close()
+    drawn = Renderer(Scene(robot), (), home, robot_files._ring(robot), (480, 360))
+    frame = drawn.frame(RenderState(home[0]), 75).astype(int).sum(axis=2)
+    drawn.close()
     darker = median_filter(frame, 5) - frame
     assert (darker[:, :40] <= 40).all()
     assert (darker[:, -40:] <= 40).all()
 
 
 def test_a_turntable_is_a_video_of_one_turn(monkeypatch, tmp_path):
-    monkeypatch.setattr(film, "SIZE", (64, 48))
-    monkeypatch.setattr(film, "NUM_FRAMES", 8)
+    monkeypatch.setattr(renderer, "SIZE", (64, 48))
+    monkeypatch.setattr(robot_files, "NUM_FRAMES", 8)
     path = tmp_path / "turn.gif"
-    path.write_bytes(film.turntable(arm(), ".gif"))
+    path.write_bytes(robot_files.turntable(arm(), ".gif"))
     frames = imageio.mimread(path)
     assert len(frames) == 8
     assert frames[0].shape[:2] == (48, 64)
@@ -213,7 +214,7 @@ def test_a_script_opens_another_page_in_place(viewer):
     on = viewer()
     with PlainClient(on.port, "?population=") as client:
         script = Script(client, on.port)
-        client.shows("Grammars")
+        client.shows("Splits")
         (first,) = on.sessions.values()
         assert script.send("open", f"?robot={A}", visit=1) == 200
         client.control("Checkbox", "x-ray")
@@ -263,7 +264,7 @@ def test_only_the_script_of_a_page_can_change_it(viewer):
         assert script.send("choose", A, token="../library") == 404
     client.websocket.close()
     with PlainClient(on.port, "?population=") as other:
-        other.shows("Grammars")
+        other.shows("Splits")
         assert script.send("open", "?split=") == 404
 
 
@@ -274,8 +275,6 @@ def test_only_the_script_of_a_page_can_change_it(viewer):
         ("?population=", "population=extrapolation/arms/reach"),
         ("?split=", "split=extrapolation/arms/reach"),
         ("?compare=", "Compare two to four robots"),
-        (f"?play=&chosen={B}", "Play which task?"),
-        (f"?play=&chosen={B}", f'href="?play=push&amp;robot={B}"'),
     ],
 )
 def test_pages_without_a_subject_list_what_there_is(shared_viewer, query, text):

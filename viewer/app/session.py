@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +17,12 @@ import viser
 from morphgen.errors import MorphgenError
 from morphgen.progress import show_progress
 from morphgen.viewer import markup
-from morphgen.viewer.app.address import Address, AddressError, require_few_chosen
+from morphgen.viewer.app.address import (
+    Address,
+    AddressError,
+    parse_count,
+    require_few_chosen,
+)
 from morphgen.viewer.app.frame import REVEAL, bar_html, call, shown_address, tray_html
 from morphgen.viewer.app.viser_internals import run_javascript
 from morphgen.viewer.app.workers import SharedResults, Workers
@@ -317,3 +323,53 @@ class Session:
 def set_value(handle: Any, value: object) -> None:  # noqa: ANN401
     """Set the value of a control, which viser's types declare as read-only."""
     handle.value = value
+
+
+def bind(session: Session, key: str, control: Any, keys: Sequence[str] = ()) -> None:  # noqa: ANN401
+    """Keep the value of a control in the page's address; its present value is the default.
+
+    A value of the address that it cannot have is left out with a note. ``keys`` are the texts of a
+    dropdown's options, by default these, or that of a check box that is on.
+    """
+    default, keys = control.value, tuple(keys)
+
+    def write() -> str:
+        value = control.value
+        if value == default:
+            return ""
+        if isinstance(control, viser.GuiDropdownHandle):
+            return keys[control.options.index(value)] if keys else str(value)
+        if isinstance(control, viser.GuiCheckboxHandle):
+            return keys[0]
+        return f"{value:g}" if isinstance(value, float) else str(value)
+
+    def apply(text: str) -> None:
+        if (value := parse_value(control, text, keys)) is None:
+            valid = "a number"
+            if isinstance(control, viser.GuiDropdownHandle):
+                valid = ", ".join(keys or control.options)
+            raise AddressError(f"{key}={text[:40]} was left out; expected {valid[:200]}")
+        set_value(control, value)
+
+    session.keep(key, write, apply)
+
+
+def parse_value(control: Any, text: str, keys: Sequence[str] = ()) -> Any:  # noqa: ANN401
+    """Return the value of a control that a text of an address stands for; None for none."""
+    match control:
+        case viser.GuiDropdownHandle():
+            keys = keys or control.options
+            return control.options[keys.index(text)] if text in keys else None
+        case viser.GuiCheckboxHandle():
+            return text in keys
+        case viser.GuiNumberHandle():
+            count = parse_count(text, -1)
+            return None if count < 0 else count
+        case viser.GuiSliderHandle():
+            try:
+                number = float(text)
+            except ValueError:
+                return None
+            low, high = control.min, control.max
+            return None if math.isnan(number) else type(low)(min(max(number, low), high))
+    return text

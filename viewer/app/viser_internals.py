@@ -7,8 +7,6 @@ No other module of the viewer uses a private name of viser. ``pyproject.toml`` r
 - Callbacks of the camera: viser can add them, but not remove them.
 - Message classes and handlers: viser applies what browsers send without validating it, so
   ``app.server`` has to see it first. Public callbacks run only after the value has been applied.
-- Identities of controls: a page has to know which element of the browser is a control, to mark a
-  slider and to notice the pointer over it; viser has no event for that.
 - Share links: a browser may ask viser to publish the page on the internet through another server,
   and viser has no option that forbids it.
 """
@@ -87,11 +85,6 @@ def replace_handlers(
 def input_handle(client: viser.ClientHandle, uuid: str) -> Any | None:  # noqa: ANN401
     """Return the control that a browser's message names; None if the page has no such control."""
     return client.gui._gui_input_handle_from_uuid.get(uuid)
-
-
-def control_id(handle: Any) -> str:  # noqa: ANN401
-    """Return the identity of a control; its element in the browser has it as ``id``."""
-    return str(handle._impl.uuid)
 
 
 def discard_upload(client: viser.ClientHandle, transfer_uuid: str) -> None:

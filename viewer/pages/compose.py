@@ -36,9 +36,8 @@ from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address, AddressError, pack_text, parse_count, unpack_text
 from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.session import Session, set_value
-from morphgen.viewer.pages.robot import PANEL_WIDTH, summary
+from morphgen.viewer.pages.robot import PANEL_WIDTH
 from morphgen.viewer.robot_files import new_bundle_files, zip_files
-from morphgen.viewer.robot_tables import part_title, slider_step
 from morphgen.viewer.robot_uri import (
     DEFAULT_WORDS,
     DERIVATION,
@@ -198,7 +197,7 @@ class ComposingTab(ABC):
             name.replace("_", " ") + (f" ({parameter.unit})" if parameter.unit else ""),
             low,
             high,
-            1.0 if parameter.integer else slider_step(low, high),
+            1.0 if parameter.integer else markup.slider_step(low, high),
             min(max(value, low), high),
             marks=tuple((end, f"{end:.3g}") for end in (low, high)),
             hint=parameter.summary or name,
@@ -293,7 +292,7 @@ class ParametersTab(ComposingTab):
                 is_root = node is derivation
                 parameters = manifest.parameters if is_root else manifest.attached_parameters
                 if names := [name for name in parameters if name in values]:
-                    with gui.add_folder(part_title(node.label, node.part)):
+                    with gui.add_folder(markup.part_title(node.label, node.part)):
                         for name in names:
                             change = functools.partial(self._change, node.label, name)
                             key = f"{node.label}.{name}"
@@ -522,7 +521,7 @@ class ComposePage:
         """Show a robot in place of the previous one, and check it in the background."""
         session, self.shown = self._session, shown
         change = self._view.replace_robot(shown.robot)
-        self._summary.content = summary(
+        self._summary.content = markup.summary(
             shown.robot,
             f" · {markup.link(Address('robot', (shown.uri,)), 'open its page')} · "
             + markup.choose_box(shown.uri, "choose")

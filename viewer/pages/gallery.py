@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -26,10 +26,8 @@ from morphgen.tasks.registry import TASKS
 from morphgen.viewer import markup, robot_rows
 from morphgen.viewer.app.address import Address, AddressError, parse_count
 from morphgen.viewer.app.frame import call
-from morphgen.viewer.app.session import Session, set_value
+from morphgen.viewer.app.session import Session, bind, set_value
 from morphgen.viewer.app.uploads import store_upload
-from morphgen.viewer.app.workers import WorkerDied
-from morphgen.viewer.controls import bind
 from morphgen.viewer.robot_files import Thumbnail, make_thumbnail, thumbnail_of_picture
 from morphgen.viewer.robot_uri import (
     DEFAULT_WORDS,
@@ -121,16 +119,16 @@ def add_filter(gallery: Gallery) -> None:
     gallery.controls["search"] = gui.add_text("Search", "")
     bind(session, "search", gallery.controls["search"])
     _add_dropdown(gallery, "sort", "Sort by", _SORTS)
-    is_filtered = not session.address.state.keys().isdisjoint({*robot_rows.FILTERS[1:], "size"})
+    is_filtered = not session.address.state.keys().isdisjoint(robot_rows.FILTERS[1:])
     with gui.add_folder("Filter", expand_by_default=is_filtered):
         for key in robot_rows.WORDS_OF_ROWS:
             choices = (_ALL, *robot_rows.fact_choices(gallery.rows, key))
-            label = _role_name(gallery) if key == "role" else key
+            role = "kind of part" if gallery.noun == "part" else "side"
+            label = role if key == "role" else key
             _add_dropdown(gallery, key, label.capitalize(), choices)
         _add_dropdown(gallery, "findings", "Findings", (_ALL, "with", "without"))
         for fact in robot_rows.NUMBERS:
             _add_range(gallery, fact)
-        _add_dropdown(gallery, "size", "On a page", tuple(map(str, robot_rows.PAGE_SIZES)))
 
 
 def parse_range(fact: str, text: str, limits: tuple[float, float] | None) -> tuple[float, float]:
@@ -158,22 +156,16 @@ def _add_dropdown(gallery: Gallery, key: str, label: str, keys: Collection[str])
     """Add a dropdown, which is shown if there is a choice; the first is the default."""
     gui, labels = gallery.session.client.gui, tuple(keys)
     if key == "sort":
-        labels = tuple(_sort_label(gallery, each) for each in keys)
+        labels = tuple(map(_sort_label, keys))
     gallery.controls[key] = gui.add_dropdown(label, labels, visible=len(keys) > 1)
     bind(gallery.session, key, gallery.controls[key], tuple(keys))
 
 
-def _role_name(gallery: Gallery) -> str:
-    """Return what the roles of rows are: kinds of parts, or sides of a split."""
-    return "kind of part" if gallery.noun == "part" else "side"
-
-
-def _sort_label(gallery: Gallery, key: str) -> str:
+def _sort_label(key: str) -> str:
     """Return the text of an order, such as ``reach, largest first``."""
     name = key.removeprefix("-")
-    last = {"order": "last first"} | dict.fromkeys(("name", *robot_rows.WORDS_OF_ROWS), "Z to A")
-    text = _role_name(gallery) if name == "role" else name
-    return f"{text}, {last.get(name, 'largest first')}" if key != name else text
+    last = {"order": "last first", "name": "Z to A"}.get(name, "largest first")
+    return f"{name}, {last}" if key != name else name
 
 
 def _add_range(gallery: Gallery, fact: str) -> None:
@@ -219,19 +211,8 @@ def load_bundle_pictures(gallery: Gallery, rows: Iterable[robot_rows.Row]) -> No
 def load_pictures(
     gallery: Gallery, rows: Sequence[robot_rows.Row], is_wanted: Callable[[], bool] = lambda: True
 ) -> None:
-    """Load or draw pictures that rows lack and want; again, once, if a worker dies."""
+    """Load pictures that rows lack, or draw them in the workers, and show them as they arrive."""
     load_bundle_pictures(gallery, rows)
-    try:
-        _request_missing(gallery, rows, is_wanted)
-    except WorkerDied:
-        gallery.session.notify("A worker died", "another one continues with the thumbnails")
-        _request_missing(gallery, rows, is_wanted)
-
-
-def _request_missing(
-    gallery: Gallery, rows: Sequence[robot_rows.Row], is_wanted: Callable[[], bool]
-) -> None:
-    """Draw missing thumbnails in the workers, and show them as they arrive."""
     session, workers = gallery.session, gallery.session.workers
     pending = {}
     for row in rows:
@@ -263,12 +244,7 @@ CONTROLS_WIDTH = 330.0  # width of the controls [pixels]
 CANVAS_WIDTH = 120.0  # width that viser keeps free for its scene between the panels [pixels]
 MIN_WIDTH = 240.0  # width of the panel of cards at least [pixels]
 NARROW = 576  # width of a window below which viser has one panel, at the bottom [pixels]
-_PAGE_BUTTONS: Mapping[str, Callable[[int], int]] = {
-    "first": lambda number: 1,
-    "prev": lambda number: number - 1,
-    "next": lambda number: number + 1,
-    "last": lambda number: 10**9,  # clipped to the last page
-}
+PAGE_SIZE = 24  # robots on a page
 
 
 def open_panels(
@@ -301,10 +277,12 @@ def add_controls(gallery: Gallery) -> None:
     gallery.page_number = parse_count(session.address.state.get("n", ""), 1)
     session.title = gallery.title
     session.apply_state()
-    buttons = session.client.gui.add_button_group("Page", tuple(_PAGE_BUTTONS))
+    buttons = session.client.gui.add_button_group("Page", ("first", "prev", "next", "last"))
 
     def turn_page() -> None:
-        show_page(gallery, _PAGE_BUTTONS[buttons.value](gallery.page_number))
+        number = gallery.page_number
+        targets = {"first": 1, "prev": number - 1, "next": number + 1, "last": len(gallery.rows)}
+        show_page(gallery, targets[buttons.value])
 
     for control in gallery.controls.values():
         session.on_change(control, lambda: show_page(gallery, 1), "filter")
@@ -314,11 +292,10 @@ def add_controls(gallery: Gallery) -> None:
 
 def show_page(gallery: Gallery, number: int) -> None:
     """Show a page of the robots that pass the filter, and request missing thumbnails."""
-    session, size = gallery.session, int(gallery.controls["size"].value)
-    state = session.state()
+    session, state = gallery.session, gallery.session.state()
     passing = (row for row in gallery.rows if robot_rows.passes(row, state))
     rows = robot_rows.sort_rows(passing, state.get("sort") or "order")
-    gallery.page_rows, gallery.page_number, count = robot_rows.select_page(rows, number, size)
+    gallery.page_rows, gallery.page_number, count = robot_rows.select_page(rows, number, PAGE_SIZE)
     session.show_state()
     total = "" if len(rows) == len(gallery.rows) else f" of {len(gallery.rows)}"
     noun = gallery.noun if len(gallery.rows) == 1 else f"{gallery.noun}s"
@@ -529,6 +506,6 @@ def section_links(files: FileAccess, page: str = "library") -> str:
         html += section("Robots in this folder", robots, ("gallery", "population"), empty)
     empty = "none yet: choose robots in a gallery, then press split"
     html += section("Splits", [*own, *split_names()], ("split", "population"), empty)
-    if page in ("library", "population"):
-        html += section("Grammars", grammar_names(), ("compose", "population"))
+    if page == "library":
+        html += section("Grammars", grammar_names(), ("compose",))
     return html

@@ -14,19 +14,28 @@ import viser
 from viser import uplot
 
 from morphgen.errors import MorphgenError, TaskError, nearest
+from morphgen.grammar.robot_source import is_set_folder
 from morphgen.rl.baselines import baselines_for
 from morphgen.rl.shipped_policies import is_named, policies_for, zero_shot_policy
+from morphgen.splits.split_file import split_names
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.task import TaskConfig
 from morphgen.typing import Array
 from morphgen.viewer import markup, rollout
 from morphgen.viewer.app.address import MAX_PLAYED, Address, AddressError
-from morphgen.viewer.app.session import Session, set_value
-from morphgen.viewer.app.workers import named
-from morphgen.viewer.controls import RobotPicker, Robots, bind, robot_lists
-from morphgen.viewer.episode import Episode, score_until, snapshot
+from morphgen.viewer.app.session import Session, bind, set_value
 from morphgen.viewer.pages.gallery import show_index
-from morphgen.viewer.robot_uri import DEFAULT_WORDS, WORDS, FileAccess, uri_name
+from morphgen.viewer.robot_rows import folder_rows, robot_folders, split_rows
+from morphgen.viewer.robot_uri import (
+    DEFAULT_WORDS,
+    WORDS,
+    FileAccess,
+    member_split,
+    parent_folder,
+    resolve_split,
+    uri_name,
+)
+from morphgen.viewer.rollout import Episode, score_until, snapshot
 from morphgen.viewer.scene.rollout import RolloutScene, add_episode, episode_page, show_step
 from morphgen.viewer.scene.stage import look_at
 
@@ -39,29 +48,14 @@ ACTIONS = ("replace", "add", "only")  # replace the first robot, add one, or rem
 
 def show(session: Session) -> None:
     """Build the page."""
-    subject = session.address.subject
-    if not subject and "policy" not in session.address.state:
-        show_tasks(session)
-        return
-    header = markup.breadcrumbs((subject or "play", None))
+    header = markup.breadcrumbs((session.address.subject or "play", None))
     session.open_panel(PANEL_WIDTH, header, "reading")
     trained_on = complete_address(session)
     if (task := session.address.subject) not in TASKS:
         raise MorphgenError(f"no task {task!r} to play{nearest(task, TASKS)}")
     page = PlayPage(session)
     page.add_rollout_controls(trained_on)
-    page.add_downloads()
-
-
-def show_tasks(session: Session) -> None:
-    """Build the page that asks for the task of a rollout, of the chosen robots if there are any."""
-    session.open_panel(PANEL_WIDTH, markup.breadcrumbs(("play", None)), left=True)
-    robots = (session.address.robots or session.chosen)[:MAX_PLAYED]
-    tasks = [markup.button_link(Address("play", (task,), robots=robots), task) for task in TASKS]
-    hint = markup.dim("robots, policy and simulator can be chosen then")
-    html = f"<h2>Play which task?</h2><p>{' '.join(tasks)}</p>{hint}"
-    session.client.gui.add_html(markup.framed(html))
-    session.show_address("play")
+    page.add_download()
 
 
 class PlayPage:
@@ -82,8 +76,6 @@ class PlayPage:
         self._charts: list[viser.GuiUplotHandle] = []  # of distance and score
         self._fault = gui.add_html("")
         buttons = gui.add_button_group("Episode", ("play", "pause", "back", "step"))
-        speeds = tuple(f"{speed:g}x" for speed in rollout.SPEEDS)
-        speed = gui.add_dropdown("speed", speeds, initial_value="1x")
         hint = "as far as it was simulated"
         self._time = gui.add_slider("time (s)", 0.0, 6.0, 0.02, 0.0, hint=hint)
         self._score, self._plots = gui.add_html(""), gui.add_folder("Distance and score")
@@ -94,9 +86,6 @@ class PlayPage:
             "step": lambda: self.player.go_by(1),
         }
         session.on_change(buttons, lambda: commands[buttons.value]())
-        session.on_change(
-            speed, lambda: self.player.set_speed(float(speed.value.removesuffix("x")))
-        )
         session.on_change(self._time, self._go_to_time, "time")
         session.keep("t", self._write_time, self._apply_time)
 
@@ -184,32 +173,21 @@ class PlayPage:
         session.apply_state()
         restart()
 
-    def add_downloads(self) -> None:
-        """Add buttons that send the episode, as far as it is simulated, as a film or a page."""
-        gui, session = self.session.client.gui, self.session
+    def add_download(self) -> None:
+        """Add a button that sends the episode, as far as it is simulated, as a web page."""
+        session = self.session
+        button = session.client.gui.add_button("Web page (.html)", icon=viser.Icon.DOWNLOAD)
 
-        def send(suffix: str, make: Callable[[Episode], bytes]) -> None:
+        def send() -> None:
             if self._source is None:
                 raise MorphgenError("there is no episode yet")
             episode = snapshot(self._source.episode)
-            seconds = episode.num_steps * episode.period
-            name = f"{episode.task}-{episode.tracks[0].robot.name}-{episode.seed}{suffix}"
-            with session.activity(f"making the {suffix} of {seconds:.2f} s"):
-                session.send_file(name, make(episode))
+            name = f"{episode.task}-{episode.tracks[0].robot.name}-{episode.seed}.html"
+            with session.activity(f"making the page of {episode.num_steps * episode.period:.2f} s"):
+                page = session.workers.call(episode_page, episode, session.dark)
+                session.send_file(name, page)
 
-        film = functools.partial(session.workers.call, named("morphgen.viewer.film:render_video"))
-        downloads: tuple[tuple[str, str, Callable[[Episode], bytes]], ...] = (
-            ("Film (.mp4)", ".mp4", film),
-            (
-                "Web page (.html)",
-                ".html",
-                lambda episode: session.workers.call(episode_page, episode, session.dark),
-            ),
-        )
-        with gui.add_folder("Get"):
-            for label, suffix, make in downloads:
-                button = gui.add_button(label, icon=viser.Icon.DOWNLOAD)
-                session.on_press(button, functools.partial(send, suffix, make))
+        session.on_press(button, send)
 
     def show_start(self, source: rollout.EpisodeSource) -> None:
         """Show a new episode at its start."""
@@ -295,6 +273,79 @@ class PlayPage:
     def _show_faults(self, texts: Iterable[str]) -> None:
         redact = self.session.files.redact
         self._fault.content = "".join(markup.error(redact(text)) for text in texts)
+
+
+ARMS = "arms with a plate"
+MAX_CHOICES = 500  # robots that a dropdown offers; others can be named by words
+
+Robots = list[tuple[str, str]]  # names and URIs
+RobotLists = Mapping[str, Callable[[], Robots]]  # functions that list robots, by source
+
+
+class RobotPicker:
+    """Controls that pick a robot: from a list to search, or by words of the command."""
+
+    def __init__(self, session: Session, lists: RobotLists, current: Callable[[], str]) -> None:
+        """Add the controls; ``current`` returns the URI of the robot that is shown first."""
+        gui, self._lists, self._current = session.client.gui, lists, current
+        self._source = gui.add_dropdown("from", tuple(lists))
+        self.robot = gui.add_dropdown("robot", ("",), hint="type to search")
+        hint = "such as arm=ur5 ee=plane, or the folder of a bundle"
+        self._words = gui.add_text("or words", "", hint=hint)
+        self._uris: dict[str, str] = {}  # URIs of the robots in the dropdown, by label
+        session.on_change(self._source, self._list_robots)
+        self._list_robots()
+
+    def _list_robots(self) -> None:
+        """Fill the dropdown of robots from the chosen source, each with a label of its own."""
+        current, robots = self._current(), self._lists[self._source.value]()[:MAX_CHOICES]
+        if current and current not in (uri for _, uri in robots):
+            robots = [(current, current), *robots]
+        self._uris = {}
+        for name, uri in robots:
+            while name in self._uris:
+                name += "'"
+            self._uris[name] = uri
+        self.robot.options = tuple(self._uris)
+        if current:
+            set_value(self.robot, next(name for name, uri in self._uris.items() if uri == current))
+
+    def picked_uri(self) -> str:
+        """Return the URI of the robot that the user named or picked, and clear the words."""
+        text = self._words.value.strip()
+        if not text:
+            return self._uris[self.robot.value]
+        set_value(self._words, "")
+        return WORDS + text if "=" in text and ":" not in text else text
+
+
+def robot_lists(uri: str, files: FileAccess, first: RobotLists) -> RobotLists:
+    """Return lists of robots to pick from, those beside a robot and ``first`` before others."""
+
+    def folder_robots(folder: str) -> Robots:
+        return [(row.name, row.uri) for row in folder_rows(folder, files)]
+
+    def split_robots(split: str) -> Robots:
+        rows = split_rows(split, resolve_split(split, files))
+        return [(f"{row.role}: {row.name}", row.uri) for row in rows]
+
+    def arms() -> Robots:
+        names = files.library.names("arm")
+        plates = [(arm, f"{WORDS}arm={arm} ee=plane") for arm in names]
+        return [*plates, ("planar-cube", f"{WORDS}base=planar ee=cube")]
+
+    lists = dict(first)
+    if split := member_split(uri):
+        lists[split] = functools.partial(split_robots, split)
+    folder = parent_folder(uri)
+    if folder and is_set_folder(files.path(folder)):
+        lists[folder] = functools.partial(folder_robots, folder)
+    lists[ARMS] = arms
+    for name in robot_folders(files.roots[0]):
+        lists.setdefault(name, functools.partial(folder_robots, name))
+    for split in split_names():
+        lists.setdefault(split, functools.partial(split_robots, split))
+    return lists
 
 
 def default_policy(task: str, *, obstacles: bool) -> str:
@@ -426,7 +477,7 @@ def show_demos(session: Session) -> None:
         seek(number.value)  # an address may name an episode that its other choices leave out
     else:
         play()  # says that there is no such episode
-    page.add_downloads()
+    page.add_download()
 
 
 def describe_episode(episode: Episode) -> str:

@@ -1,23 +1,15 @@
-"""The page of a population: robots on one ground, arranged, moved and selected together.
-
-They are arrays, so that a few operations move all of them. Every visual shape is an instance of a
-unit box, cylinder or sphere, or of a mesh; a capsule is three instances. Arrays over instances are
-sorted by what they are instances of.
-"""
+"""The pages of a population: robots on one ground, selected together, or compared."""
 
 from __future__ import annotations
 
 import functools
-import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-import torch
-import trimesh
 import viser
 from numpy.typing import NDArray
 
@@ -27,265 +19,75 @@ from morphgen.encoding.tokens import default_max_links
 from morphgen.errors import MorphgenError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import split_colours
-from morphgen.grammar.grammar_file import SUFFIX, grammar_names, grammar_text
 from morphgen.grammar.library import Library
-from morphgen.grammar.sampling import robot_name, sample_robot
-from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
-from morphgen.model.kinematics import joint_limits
-from morphgen.model.kinematics_torch import KinematicTree, compile_tree, quaternion_from_matrix
-from morphgen.model.kinematics_torch import forward_kinematics as batch_forward_kinematics
-from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Robot
 from morphgen.progress import report
-from morphgen.splits.split import SIDES, split_id
+from morphgen.splits.split import split_id
 from morphgen.splits.split_file import split_names
 from morphgen.typing import Array
 from morphgen.viewer import markup, robot_uri
 from morphgen.viewer.app.address import MAX_COMPARED, Address, parse_count
-from morphgen.viewer.app.session import Session
+from morphgen.viewer.app.session import Session, bind, parse_value, set_value
 from morphgen.viewer.app.workers import Workers
-from morphgen.viewer.controls import RoleSliders, all_roles, bind, joint_roles
 from morphgen.viewer.pages.gallery import show_index
 from morphgen.viewer.robot_files import robot_facts
-from morphgen.viewer.robot_rows import (
-    UNITS,
-    Row,
-    facts_line,
-    folder_rows,
-    sort_rows,
-    split_rows,
-    uri_rows,
-)
+from morphgen.viewer.robot_rows import Row, facts_line, folder_rows, split_rows, uri_rows
 from morphgen.viewer.scene import stage
+from morphgen.viewer.scene.population import (
+    MAX_SHADOWS,
+    Population,
+    PopulationScene,
+    ReadRobot,
+    arrange,
+    make_population,
+    move_roles,
+)
 from morphgen.viewer.scene.robot import robot_bounds
 
-UNIT_BOX, UNIT_CYLINDER, UNIT_SPHERE = Box((1.0, 1.0, 1.0)), Cylinder(0.5, 1.0), Sphere(0.5)
-"""Primitives of which the others are scaled copies; their bounding boxes have edges of 1 m."""
-Prototype = Box | Cylinder | Sphere | Mesh  # geometry of which instances are scaled copies
+MIDDLE = 0.5  # position of a slider whose joints are at home
 
 
-@dataclass(frozen=True, eq=False)
-class Instances:
-    """The shapes of all robots; m instances."""
+class RoleSliders:
+    """Sliders that move the joints of a role in all robots of a page; other joints stay at home."""
 
-    prototypes: dict[Prototype, slice]  # rows of the instances of each prototype
-    robot: NDArray[np.intp]  # robot of each instance, shape (m,)
-    link: NDArray[np.intp]  # link of each instance within its robot, shape (m,)
-    T_link_shape: NDArray[np.float32]  # pose of each instance on its link, shape (m, 4, 4)
-    scale: NDArray[np.float32]  # factors along the prototype's axes, shape (m, 3)
-    colour: NDArray[np.uint8]  # red, green, blue, shape (m, 3)
+    def __init__(self, session: Session, move: Callable[[], object]) -> None:
+        """Prepare for sliders; ``move`` is called after the user moved one."""
+        self.moved: dict[str, float] = {}  # shares of their ranges, of the roles that were moved
+        self._session, self._move = session, move
+        self._sliders: dict[str, viser.GuiSliderHandle[float]] = {}
 
+    def add(self, role: str, hint: str) -> None:
+        """Add the slider of a role, which is in the middle while nobody has moved it."""
+        session, moved = self._session, self.moved
+        slider = session.client.gui.add_slider(role, 0.0, 1.0, 0.01, MIDDLE, hint=hint)
+        self._sliders[role] = slider
 
-@dataclass(frozen=True, eq=False)
-class Population:
-    """Robots that are drawn and moved together; n robots with at most J independent joints."""
+        def apply(text: str) -> None:
+            """Take over a position of an address, unless it is invalid; the robots move later."""
+            if (position := parse_value(slider, text)) is not None:
+                moved[role] = position
+                set_value(slider, position)
 
-    rows: tuple[Row, ...]  # names, URIs and facts
-    robots: tuple[Robot, ...]
-    instances: Instances
-    tree: KinematicTree
-    lower: Array  # lower joint limits, padded with 0, shape (n, J) [rad or m]
-    upper: Array  # upper joint limits, padded with 0, shape (n, J) [rad or m]
-    home: Array  # home configurations within the limits, padded with 0, shape (n, J) [rad or m]
-    roles: tuple[str, ...]  # roles of the joints of any robot; see `controls.joint_roles`
-    role: NDArray[np.intp]  # index into `roles`, shape (n, J); `len(roles)` for padding
+        def read() -> None:
+            moved[role] = slider.value
+            self._move()
 
-    home_bounds: Array  # lowest and highest corners at home, shape (n, 2, 3) [m]
+        def write() -> str:
+            return f"{moved[role]:g}" if role in moved else ""
 
-    def __len__(self) -> int:
-        return len(self.robots)
+        session.on_change(slider, read, f"move {role}")
+        session.keep(role.replace(" ", ""), write, apply)
 
-
-@dataclass(frozen=True, eq=False)
-class ReadRobot:
-    """A robot that a worker has read."""
-
-    row: Row
-    robot: Robot
-    bounds: Array  # lowest and highest corner at home, shape (2, 3) [m]
-
-
-def make_population(read: Sequence[ReadRobot]) -> Population:
-    """Compile robots, at least one."""
-    robots = tuple(each.robot for each in read)
-    n, most = len(robots), max(robot.dof for robot in robots)
-    roles = all_roles(robots)
-    index = {role: i for i, role in enumerate(roles)}
-    lower, upper, home = np.zeros((3, n, most))
-    role = np.full((n, most), len(roles), dtype=np.intp)
-    for i, robot in enumerate(robots):
-        dof = robot.dof
-        lower[i, :dof], upper[i, :dof] = joint_limits(robot).T
-        home[i, :dof] = robot.home
-        role[i, :dof] = [index[name] for name in joint_roles(robot)]
-    return Population(
-        tuple(each.row for each in read),
-        robots,
-        make_instances(robots),
-        compile_tree(robots),
-        lower,
-        upper,
-        np.clip(home, lower, upper),
-        tuple(roles),
-        role,
-        np.array([each.bounds for each in read]),
-    )
-
-
-def make_instances(robots: Sequence[Robot]) -> Instances:
-    """Collect the visual shapes of robots, or the collision shapes of links without any."""
-    members: dict[Prototype, list[tuple[int, int, Array, Array, stage.Rgb]]] = {}
-    for i, robot in enumerate(robots):
-        for j, link in enumerate(robot.links):
-            for shape in link.visuals or link.collisions:
-                for prototype, pose, scale in _copies(shape):
-                    row = (i, j, pose.matrix, scale, stage.shape_colour(shape))
-                    members.setdefault(prototype, []).append(row)
-    prototypes, start = {}, 0
-    for prototype, rows in members.items():
-        prototypes[prototype] = slice(start, start + len(rows))
-        start += len(rows)
-    columns = list(zip(*(row for rows in members.values() for row in rows), strict=True))
-    robot_index, link_index, poses, scales, colours = columns or [()] * 5
-    return Instances(
-        prototypes,
-        np.array(robot_index, dtype=np.intp),
-        np.array(link_index, dtype=np.intp),
-        np.array(poses, dtype=np.float32).reshape(start, 4, 4),
-        np.array(scales, dtype=np.float32).reshape(start, 3),
-        np.array(colours, dtype=np.uint8).reshape(start, 3),
-    )
-
-
-def shape_poses(population: Population, q: Array) -> NDArray[np.float32]:
-    """Return the poses (m, 4, 4) of the instances in their robots' root frames at q (n, J)."""
-    index = torch.arange(len(population))
-    positions = torch.from_numpy(np.ascontiguousarray(q, dtype=np.float32))
-    T_root_link = batch_forward_kinematics(population.tree, index, positions).numpy()
-    instances = population.instances
-    return np.asarray(T_root_link[instances.robot, instances.link] @ instances.T_link_shape)
-
-
-def move_roles(population: Population, q: Array, shares: dict[str, float]) -> Array:
-    """Return configurations (n, J) with some roles' joints moved to shares of their ranges."""
-    values = np.array([shares.get(role, np.nan) for role in population.roles] + [np.nan])
-    share = values[population.role]
-    moved = population.lower + share * (population.upper - population.lower)
-    return np.where(np.isnan(share), q, moved)
-
-
-def _copies(shape: Shape) -> list[tuple[Prototype, Pose, Array]]:
-    pose = shape.T_link_shape
-    match shape.geometry:
-        case Box(size):
-            return [(UNIT_BOX, pose, np.array(size))]
-        case Cylinder(radius, length):
-            return [(UNIT_CYLINDER, pose, np.array((2 * radius, 2 * radius, length)))]
-        case Sphere(radius):
-            return [(UNIT_SPHERE, pose, np.full(3, 2 * radius))]
-        case Capsule(radius, length):
-            ends = [pose @ Pose((0.0, 0.0, z)) for z in (-length / 2, length / 2)]
-            middle = (UNIT_CYLINDER, pose, np.array((2 * radius, 2 * radius, length)))
-            return [middle, *((UNIT_SPHERE, end, np.full(3, 2 * radius)) for end in ends)]
-        case Mesh() as mesh:
-            return [(mesh, pose, np.ones(3))]
-
-
-MAX_FACES = 3000  # largest mesh that is drawn as it is [faces]; larger ones are simplified
-MAX_SHADOWS = 300
-"""Largest population that casts shadows [robots]: viser draws shadows up to 20 m from the camera,
-which is nearer than larger ones are seen from, and each would be drawn four times."""
-_CYLINDER_SECTIONS = 24
-_SPHERE_SUBDIVISIONS = 2
-_FADED_SHARE = 0.8  # share of the background's colour in robots that are not selected
-
-
-class PopulationScene:
-    """A population in the scene of one browser, its roots at positions (n, 2) on the ground [m]."""
-
-    def __init__(self, client: viser.ClientHandle, population: Population) -> None:
-        """Draw the robots at home, in the arrangement of a grid."""
-        self.population = population
-        self.positions, _ = arrange(population)
-        self._client = client
-        self._handles: dict[Prototype, viser.BatchedMeshHandle] = {}
-        instances, (wxyzs, origins) = population.instances, self._poses(population.home)
-        for number, (prototype, part) in enumerate(instances.prototypes.items()):
-            is_mesh = isinstance(prototype, Mesh)
-            self._handles[prototype] = client.scene.add_batched_meshes_simple(
-                f"/population/{number}",
-                *surface(prototype),
-                batched_wxyzs=wxyzs[part],
-                batched_positions=origins[part],
-                batched_scales=instances.scale[part],
-                batched_colors=stage.batch_colours(instances.colour[part]),
-                lod="auto" if is_mesh else "off",
-                cast_shadow=len(population) <= MAX_SHADOWS,
-                side="double" if is_mesh else "front",  # some meshes have their faces inside out
-            )
-
-    def parts(self) -> Iterator[tuple[viser.BatchedMeshHandle, slice]]:
-        """Yield the handle and the instances of every prototype."""
-        for prototype, part in self.population.instances.prototypes.items():
-            yield self._handles[prototype], part
-
-    def move(self, positions: Array, q: Array) -> None:
-        """Move all robots to positions and configurations (n, J); browsers get one message."""
-        self.positions = positions
-        wxyzs, origins = self._poses(q)
-        with self._client.atomic():
-            for handle, part in self.parts():
-                handle.batched_wxyzs, handle.batched_positions = wxyzs[part], origins[part]
-
-    def fade(self, selected: NDArray[np.bool_], background: stage.Rgb) -> None:
-        """Fade the robots that are not in a selection (n,), unless it is empty."""
-        instances = self.population.instances
-        colours = instances.colour.astype(np.float64)
-        if selected.any():
-            faded = (1 - _FADED_SHARE) * colours + _FADED_SHARE * np.array(background)
-            colours = np.where(selected[instances.robot][:, None], colours, faded)
-        with self._client.atomic():
-            for handle, part in self.parts():
-                handle.batched_colors = stage.batch_colours(colours[part])
-
-    def _poses(self, q: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return rotations (w, x, y, z) and positions of all instances in the world."""
-        poses = shape_poses(self.population, q)
-        poses[:, :2, 3] += self.positions[self.population.instances.robot]
-        wxyzs = quaternion_from_matrix(torch.from_numpy(poses[:, :3, :3])).numpy()
-        return wxyzs, poses[:, :3, 3]
-
-
-def surface(prototype: Prototype) -> stage.Triangles:
-    """Return the surface of a prototype, simplified because it is drawn many times."""
-    match prototype:
-        case Box():
-            return stage.triangles(prototype)
-        case Sphere(radius):
-            ball = trimesh.creation.icosphere(subdivisions=_SPHERE_SUBDIVISIONS, radius=radius)
-            return stage.mesh_arrays(ball)
-        case Cylinder(radius, length):
-            tube = trimesh.creation.cylinder(radius, length, sections=_CYLINDER_SECTIONS)
-            return stage.mesh_arrays(trimesh.graph.smooth_shade(tube, angle=stage.SHARP_ANGLE))
-        case Mesh() as mesh:
-            loaded = load_mesh(mesh)
-            if len(loaded.faces) <= MAX_FACES:
-                return stage.triangles(mesh)
-            # Arrays of meshes are read-only, which the simplification refuses.
-            arrays = np.array(loaded.vertices), np.array(loaded.faces)
-            copy = trimesh.Trimesh(*arrays, process=False)
-            simple = copy.simplify_quadric_decimation(face_count=MAX_FACES)
-            return stage.mesh_arrays(trimesh.graph.smooth_shade(simple, angle=stage.SHARP_ANGLE))
+    def go_home(self) -> None:
+        """Move all roles home."""
+        self.moved.clear()
+        for slider in self._sliders.values():
+            set_value(slider, MIDDLE)
+        self._move()
 
 
 MAX_ROBOTS = 1000  # largest population [robots]
-NUM_SAMPLED = 100  # robots that are sampled from a grammar by default
 _CHUNK = 20  # robots of one call of a worker
-ASPECT = 0.7  # width of an arrangement by its depth: seen from the front above, it fills a window
-_MAX_LABELS = 16  # labels beside rows: more would cover each other
-_WORD_GAP = 0.2  # gap between neighbours [median widths]
-_LABEL_GAP = 0.3  # gap between labels and rows [m]
-_QUANTILE = 0.8  # share of a row's robots that its depth holds; others cover those behind a little
 
 
 @dataclass(frozen=True)
@@ -294,43 +96,23 @@ class Source:
 
     rows: tuple[Row, ...]  # at most `MAX_ROBOTS`, with the facts that are known
     total: int  # number of robots that the address names
-    grammar: str = ""  # name or file of the grammar from which the robots are sampled; else empty
-    seed: int = 0  # seed of the sample
-    stamp: str = ""  # changes with the files of the robots, the split or the grammar
-
-    @property
-    def key(self) -> str:
-        """Name of the robots among the results that all browsers share."""
-        return f"{hash(self)}"
+    stamp: str  # changes with the files of the robots or of the split
 
 
-def find_source(subject: str, files: robot_uri.FileAccess, seed: int, number: int) -> Source:
-    """List the robots that an address names."""
-    name, at, side = subject.rpartition("@")
-    if not at:
-        name, side = subject, ""
-    elif side not in SIDES:
-        raise robot_uri.UriError(f"{subject}: unknown side {side!r}; expected @train or @test")
-    if name in grammar_names() or name.endswith(SUFFIX):
-        number = min(max(number, 1), MAX_ROBOTS)
-        grammar = robot_uri.resolve_grammar(name, files)
-        names = [robot_name(grammar, i) for i in range(number)]
-        rows = [Row(text, text, grammar.name, order=i) for i, text in enumerate(names)]
-        return Source(tuple(rows), number, name, seed, grammar_text(grammar))
-    if name in split_names() or name.endswith(".yaml") or (files.path(name) / SPLIT_FILE).is_file():
-        split = robot_uri.resolve_split(name, files)
-        rows = [row for row in split_rows(name, split) if side in ("", row.role)]
-        stamp = split_id(split)
-    elif side:
-        raise robot_uri.UriError(f"{subject}: only a split has sides; {name} is a folder")
-    else:
-        return _listed_source(folder_rows(name, files), files)
-    return Source(tuple(rows[:MAX_ROBOTS]), len(rows), stamp=stamp)
+def find_source(subject: str, files: robot_uri.FileAccess) -> Source:
+    """List the robots of a split or a folder."""
+    is_split = subject in split_names() or subject.endswith(".yaml")
+    if is_split or (files.path(subject) / SPLIT_FILE).is_file():
+        split = robot_uri.resolve_split(subject, files)
+        rows = split_rows(subject, split)
+        return Source(tuple(rows[:MAX_ROBOTS]), len(rows), split_id(split))
+    return listed_source(folder_rows(subject, files), files)
 
 
-def _listed_source(rows: Sequence[Row], files: robot_uri.FileAccess) -> Source:
+def listed_source(rows: Sequence[Row], files: robot_uri.FileAccess) -> Source:
+    """Return the robots of rows."""
     stamp = "\n".join(robot_uri.content_hash(row.uri, files) for row in rows[:MAX_ROBOTS])
-    return Source(tuple(rows[:MAX_ROBOTS]), len(rows), stamp=stamp)
+    return Source(tuple(rows[:MAX_ROBOTS]), len(rows), stamp)
 
 
 def load_population(
@@ -338,11 +120,8 @@ def load_population(
 ) -> tuple[Population, list[tuple[str, str]]]:
     """Read the robots in the workers; return also the name and error of those that are broken."""
     chunks = [source.rows[i : i + _CHUNK] for i in range(0, len(source.rows), _CHUNK)]
-    calls = [
-        workers.submit(read_robots, chunk, files, source.grammar, source.seed) for chunk in chunks
-    ]
     results: list[ReadRobot | tuple[str, str]] = []
-    for call in calls:
+    for call in [workers.submit(read_robots, chunk, files) for chunk in chunks]:
         read_chunk: list[ReadRobot | tuple[str, str]] = workers.result(call)
         results += read_chunk
         report(len(results), len(source.rows))
@@ -354,84 +133,19 @@ def load_population(
 
 
 def read_robots(
-    rows: Sequence[Row], files: robot_uri.FileAccess, grammar_name: str = "", seed: int = 0
+    rows: Sequence[Row], files: robot_uri.FileAccess
 ) -> list[ReadRobot | tuple[str, str]]:
-    """In a worker, read or sample robots and measure them, or return name and error of each."""
-    grammar = robot_uri.resolve_grammar(grammar_name, files) if grammar_name else None
+    """In a worker, read robots and measure them, or return the name and error of each."""
     results: list[ReadRobot | tuple[str, str]] = []
     for row in rows:
         try:
-            if grammar is None:
-                robot = robot_uri.read_robot_uri(row.uri, files)
-            else:
-                sample = sample_robot(grammar, files.library, row.order, seed=seed)
-                robot, uri = sample.robot, f"{robot_uri.DERIVATION}{sample.derivation}"
-                codes = sorted({finding.code for finding in sample.findings})
-                row = replace(row, uri=uri, findings=tuple(codes))
-            robot = split_colours(robot)
+            robot = split_colours(robot_uri.read_robot_uri(row.uri, files))
             if row.dof is None or row.reach is None:
                 row = row.completed(robot_facts(robot))
             results.append(ReadRobot(row, robot, np.array(robot_bounds(robot))))
         except MorphgenError as error:
             results.append((row.name, files.redact(error)))
     return results
-
-
-Labels = list[tuple[str, tuple[float, float]]]  # texts on the ground and their positions [m]
-
-
-def arrange(population: Population, fact: str = "") -> tuple[Array, Labels]:
-    """Return positions (n, 2) [m] of robots in rows from the far left to the near right.
-
-    With a fact, the smallest come first, and labels have the values of rows' first robots. Without,
-    few robots stand in one row, with their names.
-    """
-    rows, bounds = population.rows, population.home_bounds
-    index = {row.uri: i for i, row in enumerate(rows)}
-    order = [index[row.uri] for row in sort_rows(rows, fact)] if fact else list(range(len(rows)))
-    is_one_row = not fact and len(rows) <= MAX_COMPARED
-    places, firsts = _rows_of(bounds[order], one=is_one_row)
-    positions = np.zeros((len(rows), 2))
-    positions[order] = places
-    if is_one_row:
-        return positions, [
-            (row.name, (x, y)) for row, (x, y) in zip(rows, positions.tolist(), strict=True)
-        ]
-    if not fact:
-        return positions, []
-    edge = float((places[:, 0] + bounds[order, 0, 0]).min()) - _LABEL_GAP
-    labels: Labels = []
-    for i in firsts[:: math.ceil(len(firsts) / _MAX_LABELS)]:
-        value = getattr(rows[order[i]], fact)
-        text = "unknown" if value is None else f"{value:.3g} {UNITS[fact]}"
-        labels.append((text, (edge, float(places[i, 1]))))
-    return positions, labels
-
-
-def _rows_of(bounds: Array, *, one: bool) -> tuple[Array, list[int]]:
-    """Return a place (n, 2) [m] for each robot, like words of a text, and each row's first robot.
-
-    A row takes the depth of most of its robots, so that few large ones do not shrink others.
-    """
-    size = np.maximum(bounds[:, 1] - bounds[:, 0], 0.01)
-    slot = size[:, 0] + _WORD_GAP * np.median(size[:, 0])
-    # Rows also need room for their height, by which they hide what is behind them.
-    depth = np.maximum(1.2 * size[:, 1], np.maximum(0.35 * size[:, 0], 0.75 * size[:, 2]))
-    ends = np.cumsum(slot)
-    num_rows = (
-        1 if one else max(round(ends[-1] / math.sqrt(ASPECT * float((slot * depth).sum()))), 1)
-    )
-    row = np.minimum((ends - slot / 2) / ends[-1] * num_rows, num_rows - 1e-9).astype(int)
-    positions, firsts, y = np.zeros((len(bounds), 2)), [], 0.0
-    for k in np.unique(row):
-        members = np.flatnonzero(row == k)
-        firsts.append(int(members[0]))
-        right = np.cumsum(slot[members])
-        left = right - slot[members] - right[-1] / 2
-        y -= float(np.quantile(depth[members], _QUANTILE))
-        positions[members] = np.stack([left - bounds[members, 0, 0], np.full(len(left), y)], axis=1)
-    positions[:, 1] -= y / 2
-    return positions, firsts
 
 
 PANEL_WIDTH = 340.0  # width of the panel [pixels]
@@ -455,13 +169,10 @@ def show(session: Session) -> None:
     if not session.address.subject:
         show_index(session)
         return
-    subject, state = session.address.subject, session.address.state
-    seed = parse_count(state.get("seed", ""), 0)
-    number = parse_count(state.get("number", ""), NUM_SAMPLED)
-    source = find_source(subject, session.files, seed, number)
-    for key in ("seed", "number") if source.grammar else ():
-        session.keep(key)
-    _open(session, source, (subject, _gallery_address(subject, source)), ("population", None))
+    subject = session.address.subject
+    source = find_source(subject, session.files)
+    page = "split" if source.rows[0].role else "gallery"
+    _open(session, source, (subject, Address(page, (subject,))), ("population", None))
 
 
 def show_compared(session: Session) -> None:
@@ -471,7 +182,7 @@ def show_compared(session: Session) -> None:
         raise robot_uri.UriError(f"{len(uris)} robots to compare: expected 2 to {MAX_COMPARED}")
     if uris:
         rows = uri_rows(uris, session.files)
-        _open(session, _listed_source(rows, session.files), ("compare", None))
+        _open(session, listed_source(rows, session.files), ("compare", None))
         return
     session.open_panel(PANEL_WIDTH, markup.breadcrumbs(("compare", None)))
     session.client.gui.add_html(markup.framed(NONE_TO_COMPARE))
@@ -486,20 +197,13 @@ def _open(session: Session, source: Source, *steps: tuple[str, Address | None]) 
     def load() -> None:
         """Read the robots, once for all browsers, and show them."""
         population, faults = session.cached(
-            f"population {source.key}",
+            f"population {hash(source)}",
             lambda: load_population(source, session.files, session.workers),
             "reading {} robots",
         )
         session.enqueue(lambda: PopulationPage(session, source, population, faults))
 
     session.run_in_background(load)
-
-
-def _gallery_address(subject: str, source: Source) -> Address:
-    if source.grammar:
-        return Address("compose", (source.grammar,))
-    split = subject.rpartition("@")[0] or subject
-    return Address("split" if source.rows[0].role else "gallery", (split,))
 
 
 class PopulationPage:
@@ -528,13 +232,15 @@ class PopulationPage:
         self._sliders = RoleSliders(session, self._move)
         self._add_sliders()
         self._selection = gui.add_html("")
-        select = gui.add_button_group("Select", ("all", "none", "invert"))
+        select = gui.add_button_group("Select", ("all", "none"))
         choose = gui.add_button(
             "Choose", icon=viser.Icon.CHECKBOX, hint="add them to the chosen robots"
         )
         session.on_change(self._arrange, self._show_arrangement, "arrange")
         session.on_change(home, self._sliders.go_home)
-        session.on_change(select, lambda: self._change_selection(select.value))
+        session.on_change(
+            select, lambda: self.select(np.full(len(population), select.value == "all"))
+        )
         session.on_change(choose, self._choose)
         self._connect_pointer()
         session.set_status("")
@@ -575,10 +281,6 @@ class PopulationPage:
 
     def _apply_selection(self, text: str) -> None:
         self.selected = parse_selection(text, len(self.population))
-
-    def _change_selection(self, action: str) -> None:
-        everything = np.full(len(self.population), action == "all")
-        self.select(~self.selected if action == "invert" else everything)
 
     def _choose(self) -> None:
         if not self._selected_rows:
@@ -673,18 +375,12 @@ def summary(source: Source, population: Population, faults: Sequence[tuple[str, 
 
 
 def selection_text(rows: Sequence[Row]) -> str:
-    """Return the selected robots with links, and the ranges of their facts, as HTML."""
+    """Return the selected robots with links and facts as HTML."""
     if not rows:
         return markup.dim("no robot is selected")
     lines = [_row_line(row) for row in rows[:_NUM_NAMED]]
     if len(rows) > _NUM_NAMED:
         lines.append("...")
-    for fact in ("reach", "mass", "dof") if len(rows) > 1 else ():
-        values = [value for row in rows if (value := getattr(row, fact)) is not None]
-        if values:
-            low, high = min(values), max(values)
-            numbers = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
-            lines.append(f"{'' if fact == 'dof' else fact + ' '}{numbers} {UNITS[fact]}")
     return f"<b>{len(rows)} selected</b>{markup.dim('<br>'.join(lines))}"
 
 

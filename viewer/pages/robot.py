@@ -26,21 +26,14 @@ from morphgen.model.geometry import Pose, Shape
 from morphgen.model.robot import TOOL, Robot
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
-from morphgen.viewer import markup, robot_tables, robot_uri
+from morphgen.viewer import markup, robot_uri
 from morphgen.viewer.app.address import Address
-from morphgen.viewer.app.session import Session, set_value
-from morphgen.viewer.app.viser_internals import control_id
-from morphgen.viewer.app.web_page import robot_page
-from morphgen.viewer.app.workers import named
-from morphgen.viewer.controls import bind
-from morphgen.viewer.robot_files import bundle_files, zip_files
+from morphgen.viewer.app.session import Session, bind, set_value
+from morphgen.viewer.robot_files import bundle_files, robot_page, turntable, zip_files
 from morphgen.viewer.robot_rows import neighbour_uris
-from morphgen.viewer.scene import overlays as scene_overlays
 from morphgen.viewer.scene import robot as scene_robot
 from morphgen.viewer.scene import stage as scene_stage
-from morphgen.viewer.scene.overlays import remove_overlay
 
-WEB_PAGE = "robot.html"  # name of the web page in a bundle
 PANEL_WIDTH = 390.0  # width of the panel [pixels]
 RENDER_TIMEOUT = 60.0  # time in which the browser has to send a screenshot [s]
 NO_LINK = "(none)"  # choice of the dropdown of links that selects none
@@ -54,16 +47,6 @@ def show(session: Session) -> None:
     page = RobotPage(session, uri, split_colours(robot_uri.read_robot_uri(uri, session.files)))
     session.set_status("")
     session.run_in_background(page.check)
-
-
-def summary(robot: Robot, links: str) -> str:
-    """Return a robot's name and facts, followed by links as HTML."""
-    distance = kinematics.arm_reach(robot) if robot.tool and robot.dof else None
-    facts = robot_tables.summary(robot, distance)
-    return markup.framed(
-        f"<h3>{escape(robot.name)}</h3>",
-        markup.dim(facts + robot_tables.licence_line(robot) + links),
-    )
 
 
 def _location(session: Session, uri: str) -> str:
@@ -115,8 +98,8 @@ class RobotPage:
         self._checker: SelfCollisionChecker | None = None
         self._sliders: list[viser.GuiSliderHandle[float]] = []  # in the order of q
         self._folders: list[viser.GuiFolderHandle] = []  # folders of the sliders
-        gui.add_html(summary(robot, _links(robot, uri)))
-        self._card, self._mark = gui.add_html(""), gui.add_html("")
+        gui.add_html(markup.summary(robot, _links(robot, uri)))
+        self._card = gui.add_html("")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Move", viser.Icon.ARROWS_MOVE):
             buttons = gui.add_button_group("Go to", ("home", "zero", "random"))
@@ -130,7 +113,7 @@ class RobotPage:
         with tabs.add_tab("Links", viser.Icon.BINARY_TREE):
             names = (NO_LINK, *(link.name for link in robot.links))
             self._link = gui.add_dropdown("Link", names)
-            gui.add_html(markup.framed(robot_tables.link_table(robot)))
+            gui.add_html(markup.framed(markup.link_table(robot)))
         with tabs.add_tab("Check", viser.Icon.STETHOSCOPE):
             self._findings = gui.add_html("")
         with tabs.add_tab("Get", viser.Icon.DOWNLOAD):
@@ -165,7 +148,7 @@ class RobotPage:
         """Move the robot and its sliders to a configuration, shape (dof,)."""
         self.q = np.array(q, dtype=np.float64)
         for row, slider in enumerate(self._sliders):
-            value = robot_tables.rounded(self.q[row] * self._scale(row), slider.step)
+            value = markup.rounded(self.q[row] * self._scale(row), slider.step)
             set_value(slider, float(np.clip(value, slider.min, slider.max)))
         self.update_scene()
 
@@ -176,7 +159,7 @@ class RobotPage:
             if self._checker is not None:
                 (collisions,) = self._checker.penetrations([self.q])
                 self.view.paint_red({name for pair in collisions for name in pair})
-                text = robot_tables.collision_text(collisions)
+                text = markup.collision_text(collisions)
                 self._collisions.content = markup.framed(text)
             self._layers.follow()
         self.session.show_state_later()
@@ -192,14 +175,14 @@ class RobotPage:
             folder.remove()
         self._folders = []
         sliders, limits = {}, kinematics.joint_limits(robot)
-        for group in robot_tables.joint_groups(robot):
+        for group in markup.joint_groups(robot):
             with self._slider_box:
                 self._folders.append(folder := gui.add_folder(group.title))
             for row in group.rows:
                 joint, scale = robot.joints[robot.independent_joints[row]], self._scale(row)
                 low, high = (float(value) * scale for value in limits[row])
-                step = robot_tables.slider_step(low, high)
-                value = robot_tables.rounded(float(self.q[row]) * scale, step)
+                step = markup.slider_step(low, high)
+                value = markup.rounded(float(self.q[row]) * scale, step)
                 with folder:
                     sliders[row] = gui.add_slider(
                         joint.name.removeprefix(f"{group.label}_"),
@@ -208,11 +191,10 @@ class RobotPage:
                         step,
                         float(np.clip(value, low, high)),
                         marks=tuple((value, f"{value:.3g}") for value in (low, high)),
-                        hint=robot_tables.joint_hint(joint),
+                        hint=markup.joint_hint(joint),
                     )
                 session.on_change(sliders[row], functools.partial(self._slide, row), f"move {row}")
         self._sliders = [sliders[row] for row in range(robot.dof)]
-        self._mark_slider()
         session.show_state_later()
 
     def _slide(self, row: int) -> None:
@@ -229,33 +211,18 @@ class RobotPage:
         self.move(np.clip(q, *kinematics.joint_limits(robot).T))
 
     def select(self, name: str) -> None:
-        """Select a link: outline, card and slider; an empty name selects none."""
+        """Select a link, which gets an outline and a card; an empty name selects none."""
         set_value(self._link, name or NO_LINK)
-        scene_overlays.show_outline(self.view, self.robot.link_index[name] if name else None)
+        scene_robot.show_outline(self.view, self.robot.link_index[name] if name else None)
         self._show_card()
-        self._mark_slider()
         self.session.show_state()
 
     def _show_card(self) -> None:
         card = ""
         if name := self.selected:
-            text = robot_tables.link_card(self.robot, name, self.findings)
+            text = markup.link_card(self.robot, name, self.findings)
             card = f'<div class="selected">{text}</div>'
         self._card.content = markup.framed(card)
-
-    def _mark_slider(self) -> None:
-        """Colour the slider of the joint that moves the selected link."""
-        style, name = "", self.selected
-        row = joint_of_link(self.robot, self.robot.link_index[name]) if name else None
-        if row is not None:
-            control, colour = control_id(self._sliders[row]), markup.SELECTED
-            style = (
-                f'<style>[id="{control}"] .mantine-Slider-bar,[id="{control}"] '
-                f".mantine-Slider-thumb{{background:{colour}!important}}"
-                f'div:has(>*>*>label[for="{control}"]){{box-shadow:-4px 0 {colour};'
-                f"background:{colour}22}}</style>"
-            )
-        self._mark.content = style
 
     def _connect_links(self) -> None:
         """Let clicks in the scene select links."""
@@ -290,15 +257,6 @@ class RobotPage:
         self._show_card()
 
 
-def joint_of_link(robot: Robot, link: int) -> int | None:
-    """Return the index in q of the joint nearest above a link that moves it; None for the base."""
-    while link:
-        if rows := kinematics.driving_joints(robot, (link - 1,)):
-            return rows[0]
-        link = robot.parents[link]
-    return None
-
-
 def format_joints(q: Array) -> str:
     """Return a configuration as text for an address."""
     return ",".join(f"{value:.4g}" for value in q)
@@ -317,9 +275,8 @@ def parse_joints(text: str, robot: Robot) -> Array | None:
 
 GIZMO = "drag the tool"
 _SHOW_OVERLAY: Mapping[str, Callable[[scene_robot.RobotView], None]] = {
-    "joint axes": scene_overlays.show_joint_axes,
-    "centres of mass": scene_overlays.show_mass_centres,
-    "names": scene_overlays.show_names,
+    "joint axes": scene_robot.show_joint_axes,
+    "names": scene_robot.show_names,
 }
 TOGGLES = (*scene_robot.LAYERS, "x-ray", "frames", *_SHOW_OVERLAY, "workspace", GIZMO)
 """Layers, overlays and gizmo that can be shown of a robot, as named in the address."""
@@ -391,7 +348,7 @@ class Layers:
             case "drag the tool":
                 self._toggle_gizmo(on)
             case _ if not on:
-                remove_overlay(self._view, name)
+                scene_robot.remove_overlay(self._view, name)
             case _:
                 _SHOW_OVERLAY[name](self._view)
         self._session.show_state()
@@ -442,17 +399,17 @@ class Layers:
         if on:
             self._session.run_in_background(self._sample_workspace)
             return
-        remove_overlay(self._view, "workspace")
+        scene_robot.remove_overlay(self._view, "workspace")
         scene_stage.look_at(self._session.client, *scene_robot.robot_bounds(self._robot))
 
     def _sample_workspace(self) -> None:
         with self._session.activity("sampling the workspace"):
-            shell = scene_overlays.workspace_shell(self._robot)
+            shell = scene_robot.workspace_shell(self._robot)
         self._session.enqueue(lambda: self._show_workspace(shell))
 
     def _show_workspace(self, shell: scene_stage.Triangles) -> None:
         if self._is_on("workspace"):
-            scene_overlays.show_workspace(self._view, shell)
+            scene_robot.show_workspace(self._view, shell)
             bounds = (*scene_robot.robot_bounds(self._robot), *shell[0])
             low, high = np.min(bounds, axis=0), np.max(bounds, axis=0)
             scene_stage.look_at(self._session.client, low, high)
@@ -492,18 +449,9 @@ def _add_downloads(page: RobotPage) -> None:
     """Add buttons for the bundle, its files, pictures and films, and the robot's command."""
     gui, session, robot = page.session.client.gui, page.session, page.robot
     run, name = session.workers.call, page.robot.name or "robot"
-    turntable = named("morphgen.viewer.film:turntable")
-    hint = "adds robot.html, which shows the robot in 3D without a server or a network"
-    with_page = gui.add_checkbox("bundle with a web page", initial_value=False, hint=hint)
 
     def bundle() -> dict[str, bytes]:
         return run(bundle_files, page.uri, session.files)
-
-    def web_page() -> bytes:
-        return run(robot_page, robot, session.dark)
-
-    def archive() -> bytes:
-        return zip_files(name, bundle() | ({WEB_PAGE: web_page()} if with_page.value else {}))
 
     def send(suffix: str, make: Callable[[], bytes]) -> None:
         """Send a file to the browser, named after the robot."""
@@ -511,11 +459,11 @@ def _add_downloads(page: RobotPage) -> None:
             session.send_file(f"{name}{suffix}", make())
 
     downloads: Mapping[str, tuple[str, Callable[[], bytes]]] = {
-        "Bundle (.zip)": (".zip", archive),
+        "Bundle (.zip)": (".zip", lambda: zip_files(name, bundle())),
         "URDF": (".urdf", lambda: bundle()[URDF]),
         "MJCF": (".xml", lambda: bundle()[MJCF]),
         "Screenshot": (".png", lambda: _screenshot(session.client)),
-        "Web page (.html)": (".html", web_page),
+        "Web page (.html)": (".html", lambda: run(robot_page, robot, session.dark)),
         "Turntable (.mp4)": (".mp4", lambda: run(turntable, robot, ".mp4")),
         "Turntable (.gif)": (".gif", lambda: run(turntable, robot, ".gif")),
     }

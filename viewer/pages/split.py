@@ -1,4 +1,4 @@
-"""The page of a split: its robots, a map of their similarity, statistics and the audit."""
+"""The page of a split: its robots, a map of their similarity, and the audit."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from morphgen.benchmark.survey import (
     SurveyedRobot,
     compare_members,
     different_members,
-    summarize_survey,
     survey_robot,
 )
 from morphgen.encoding.similarity import MEASURES, classical_mds, to_distances
@@ -40,7 +39,6 @@ from morphgen.viewer.robot_uri import member_uri, resolve_split
 PANEL_WIDTH = 520.0  # largest width of the controls [pixels]
 PANEL_SHARE = 0.36  # largest share of the window for the controls: names on the map stay readable
 MAX_ROBOTS = 60  # robots of which every pair is compared; a map of more could not be read
-NUM_PLAYED = 4  # test robots of the link to a rollout
 
 
 SIDE_COLOURS = {"train": "#1c7ed6", "test": "#f76707"}
@@ -54,7 +52,6 @@ class SplitStudy:
     """Survey of a split's robots."""
 
     audit: Audit
-    statistics: Mapping[str, object]  # statistics by side; empty if a robot cannot be composed
     members: tuple[tuple[Side, Member], ...]  # members that can be composed, train robots first
     matrices: Mapping[str, Array]  # similarity of their pairs by measure, shape (n, n)
 
@@ -81,7 +78,9 @@ def show(session: Session) -> None:
     split = resolve_split(name, session.files)
     gallery = gallery_page.Gallery(session, split.name, split_rows(name, split), SIDES)
     gui = session.client.gui
-    header = _description(split) + _rollout_link(name, split)
+    header = _description(split) + markup.link(
+        Address("population", (name,)), "see all on one ground"
+    )
     width = min(PANEL_WIDTH, PANEL_SHARE * session.width)
     panel = gallery_page.open_panels(gallery, markup.breadcrumbs((split.name, None)), header, width)
     tabs = gui.add_tab_group()
@@ -92,8 +91,6 @@ def show(session: Session) -> None:
         panel.visible = True  # on a narrow window, too
         measure = gui.add_dropdown("measure", tuple(MEASURES), initial_value="tree")
         texts["map"] = gui.add_html(markup.framed(markup.dim("the robots are being compared")))
-    with tabs.add_tab("Statistics", viser.Icon.TABLE):
-        texts["statistics"] = gui.add_html(markup.framed(statistics_table(split.statistics)))
     with tabs.add_tab("Audit", viser.Icon.STETHOSCOPE):
         texts["audit"] = gui.add_html("")
     page = SplitPage(session, name, split, gallery, measure, texts=texts)
@@ -101,24 +98,8 @@ def show(session: Session) -> None:
     session.run_in_background(lambda: _study(page))
 
 
-def statistics_table(statistics: Mapping[str, object]) -> str:
-    """Return a table of the statistics of both sides; distributions as mean (min to max)."""
-    sides = [statistics.get(side) for side in SIDES]
-    train, test = (side if isinstance(side, Mapping) else {} for side in sides)
-    if not train or not test:
-        return markup.dim("no statistics yet")
-    rows = [
-        (escape(str(key).replace("_", " ")), _format(train.get(key)), _format(test.get(key)))
-        for key in train
-    ]
-    text = markup.table(("", *SIDES), rows, (1, 2))
-    if "cosine" in statistics:
-        text += f"<h3>Cosine of test to train</h3>{_format(statistics['cosine'])}"
-    return text
-
-
 def audit_text(audit: Audit) -> str:
-    """Return the audit's findings, the accepted ones with reasons, and the nearest robots."""
+    """Return the audit's findings, and the accepted ones with reasons."""
     text = "<h3>Findings</h3>" + markup.findings_table(audit.findings)
     if audit.accepted:
         rows = [
@@ -126,40 +107,13 @@ def audit_text(audit: Audit) -> str:
             for finding, reason in audit.accepted
         ]
         text += "<h3>Accepted</h3>" + markup.table(("code", "where", "why"), rows)
-    nearest = [
-        (escape(test), measure, escape(found.train), f"{found.value:.3f}")
-        for test, trains in audit.nearest.items()
-        for measure, found in trains.items()
-    ]
-    table = markup.table(("test", "measure", "train", ""), nearest, (3,))
-    return f"{text}<h3>Nearest train robots</h3>{table}"
+    return text
 
 
 def _description(split: Split) -> str:
     reference = f"<br>{escape(split.reference)}" if split.reference else ""
     details = f"{split.regime} · id {split_id(split)}{reference}"
     return escape(split.summary) + markup.dim(details)
-
-
-def _rollout_link(name: str, split: Split) -> str:
-    first = split.test[0]
-    robots = tuple(
-        member_uri(name, "test", member)
-        for member in split.test[:NUM_PLAYED]
-        if member.task == first.task
-    )
-    state = {"obstacles": "yes"} if first.obstacles else {}
-    address = Address("play", (first.task,), state, robots)
-    population = markup.link(Address("population", (name,)), "see all on one ground")
-    return markup.dim(f"{markup.link(address, 'see robots to test on at work')} · {population}")
-
-
-def _format(value: object) -> str:
-    if isinstance(value, Mapping):
-        mean, low, high = (value.get(key) for key in ("mean", "min", "max"))
-        if all(isinstance(number, (int, float)) for number in (mean, low, high)):
-            return f"{mean:.3g} ({low:.3g} to {high:.3g})"
-    return f"{value:.4g}" if isinstance(value, float) else escape(str(value))
 
 
 def _study(page: SplitPage) -> None:
@@ -171,9 +125,6 @@ def _study(page: SplitPage) -> None:
         lambda: study_split(page.split, folders, session.workers),
         "comparing {} robots",
     )
-    if page.study.statistics:
-        table = statistics_table(page.study.statistics)
-        page.texts["statistics"].content = markup.framed(table)
     page.texts["audit"].content = markup.framed(audit_text(page.study.audit))
     _draw_map(page)
     uris = {member_uri(page.name, side, member) for side, member in page.study.members}
@@ -216,13 +167,12 @@ def study_split(split: Split, folders: tuple[Path, ...], workers: Workers) -> Sp
 def conclude_study(
     split: Split, robots: Sequence[SurveyedRobot | Fault], folders: tuple[Path, ...]
 ) -> SplitStudy:
-    """Compare measured robots, audit the split and compute its statistics. Runs in a worker."""
+    """Compare measured robots, and audit the split. Runs in a worker."""
     survey = compare_members(split, robots, all_pairs=True)
     sound = [i for i, each in enumerate(survey.robots) if isinstance(each, SurveyedRobot)]
     members = sided_members(split)
     return SplitStudy(
         audit_survey(survey, Library(folders)),
-        summarize_survey(survey) if len(sound) == len(members) else {},
         tuple(members[i] for i in sound),
         {
             name: survey.similarity[np.ix_(sound, sound, [k])][..., 0]

@@ -13,8 +13,8 @@ from morphgen.model.geometry import Pose
 from morphgen.tasks.sim.base import Block
 from morphgen.tasks.task import Marker
 from morphgen.typing import Array
-from morphgen.viewer.app.web_page import scene_server, web_page
-from morphgen.viewer.episode import BLOCK, STRIDE, Episode, Track
+from morphgen.viewer.robot_files import scene_server, web_page
+from morphgen.viewer.rollout import BLOCK, Episode, Track
 from morphgen.viewer.scene.robot import RobotView, add_robot, robot_bounds
 from morphgen.viewer.scene.stage import Rgb, add_ground, place_camera, set_stage
 
@@ -146,6 +146,9 @@ def _add_box(scene: viser.SceneApi, name: str, block: Block, colour: Rgb) -> vis
     )
 
 
+STRIDE = 2  # control steps between two pictures of a web page
+
+
 def episode_page(episode: Episode, dark: bool) -> bytes:
     """Return a web page that plays an episode without a server or a network."""
     with scene_server() as server:
@@ -153,7 +156,7 @@ def episode_page(episode: Episode, dark: bool) -> bytes:
         scene = add_episode(server.scene, episode)
         place_camera(server.initial_camera, scene.low, scene.high)
         recording = server.get_scene_serializer()
-        for step in episode.film_steps:
+        for step in (*range(0, episode.num_steps, STRIDE), episode.num_steps):
             show_step(scene, step)
             recording.insert_sleep(STRIDE * episode.period)
         return web_page(recording, f"{episode.task}: {episode.tracks[0].robot.name}", dark=dark)
