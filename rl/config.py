@@ -239,16 +239,6 @@ SWITCHES = (
 ``PPOConfig``, then those of ``PolicyConfig``, then observation channels."""
 _FIELDS = {"fixed-deviation": "fixed_std", "mask-morphology": "proprioceptive_only"}
 """Fields of ``PolicyConfig`` of switches that have the paper's names; others have the field's."""
-ABLATION = (
-    "se-symlog-slow-critic-discrete",
-    "se-symlog-slow-critic-discrete@test",
-    "me-mlp-symlog-slow-critic-discrete",
-    "me-tf-symlog-slow-critic-discrete",
-    "me-tf-discrete",
-    "me-tf+discrete",
-    "me-tf+discrete+task-reweighting",
-)
-"""Rows of the paper's ablation table, where "symlog" stands for symlog with the slow critic."""
 
 
 @dataclass(frozen=True)
@@ -288,7 +278,7 @@ def parse_agent(text: str) -> AgentSpec:
 def parse_agents(text: str) -> list[tuple[str, AgentSpec, Side]]:
     """Read the agents of a study: their labels, their specs, and the side they are trained on."""
     agents: dict[str, tuple[AgentSpec, Side]] = {}
-    for part in ABLATION if text == "ablation" else text.split(","):
+    for part in text.split(","):
         name, at, side = part.partition("@")
         spec = parse_agent(name)
         if at and (side != "test" or not AGENTS[spec.agent].per_robot):

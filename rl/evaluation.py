@@ -75,13 +75,6 @@ class EvalConfig:
             )
 
 
-def episodes_for(steps: int, longest: int) -> int:
-    """Return the number of episodes of full length that contain a number of control steps."""
-    if steps < 1:
-        raise TaskError(f"--steps {steps}: expected 1 or more")
-    return -(-steps // longest)
-
-
 def evaluate_run(path: Path, side: Side, config: EvalConfig, mode: Mode) -> list[Score]:
     """Evaluate a run on the robots of a side of its split, or on its one robot."""
     files = list(checkpoint_files(path))

@@ -198,8 +198,8 @@ class UpdateMetrics:
     reward: float  # mean reward of a control step
     score: float = math.nan  # mean task score of a control step
     scores: tuple[float, ...] = ()
-    """Mean score of each robot, or of the robots of each grammar if they are drawn; nan for one
-    without an environment."""
+    """Mean score of each robot, nan for one without an environment; none are recorded of drawn
+    robots."""
     success: float = math.nan
     """Share of successes among the episodes that ended in the rollout; nan if none did."""
     episodes: int = 0  # number of episodes that ended in the rollout

@@ -127,13 +127,8 @@ def test_split_has_robots_statistics_and_audit():
 
 def test_a_split_is_chosen_written_built_audited_and_verified(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    rules = {
-        "hold_out": ["ee=cube"],
-        "robots": "arm={arm3,arm5} ee={cube,stick}",
-        "statistics": True,
-    }
+    rules = {"hold_out": ["ee=cube"], "robots": "arm={arm3,arm5} ee={cube,stick}"}
     split = morphgen.split("my/cubes", train=2, test=2, task=["reach"], **rules)
-    assert isinstance(split.definition.statistics["cosine"], dict)
     assert [len(side) for side in (split.train, split.test)] == [2, 2]
     file = split.write()
     assert (str(file), split.write("own.yaml").name) == ("my/cubes.yaml", "own.yaml")

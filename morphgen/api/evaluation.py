@@ -34,7 +34,6 @@ from morphgen.rl.baselines import BASELINES
 from morphgen.rl.config import spec_of
 from morphgen.rl.evaluation import (
     EvalConfig,
-    episodes_for,
     eval_config_of,
     evaluate_baseline,
     evaluate_checkpoints,
@@ -67,8 +66,7 @@ def evaluate(
     robots: str | PathLike[str] | None = None,
     *,
     on: Side | None = None,
-    episodes: int | None = None,
-    steps: int = 10_000,
+    episodes: int = 34,
     sim: str | None = None,
     workers: int | None = None,
     device: str = "cpu",
@@ -100,7 +98,6 @@ def evaluate(
             built folder; or a robot and its task, such as ``arm=ur5 ee=stick task=reach``.
         on: Side of the split, ``train`` or ``test``; by default both.
         episodes: Least number of episodes per robot.
-        steps: Number of control steps per robot, in episodes of full length, without ``episodes``.
         sim: Name of the simulator, by default that of the training.
         workers: Number of threads of MuJoCo; by default as many as the environments and the cores
             allow.
@@ -123,7 +120,7 @@ def evaluate(
         MorphgenError: If a split or a robot cannot be read, or a robot cannot do the task.
     """
     given = SimpleNamespace(**locals())
-    least = {"episodes": 1, "steps": 1, "workers": 1, "seed": 0, "goal_seed": 0}
+    least = {"episodes": 1, "workers": 1, "seed": 0, "goal_seed": 0}
     require_types(given, TaskError, "sim", "device", "goal", "method", **least)
     if on is not None:
         require_side(on)
@@ -134,8 +131,6 @@ def evaluate(
     if submission is None and method is not None:
         raise TaskError("method: only with submission")
     is_baseline = str(policy) in BASELINES
-    longest = max(config.max_episode_steps for config in default_configs())
-    given.episodes = episodes or episodes_for(steps, longest)
     if submission is not None:
         given.sim = sim or _rules_of(robots).simulator
         given.mode = mode or (None if is_baseline else "deterministic")

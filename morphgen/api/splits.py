@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from numbers import Integral
 from os import PathLike
@@ -232,7 +232,6 @@ class NewSplit(TypedDict, total=False):
     obstacles: bool
     seed: int
     max_links: int
-    statistics: bool
     jobs: int
 
 
@@ -301,7 +300,7 @@ def split(
               ``arm=* ee=*``; ``grammar``: grammars to draw from
             - ``test``: number of test robots, by default 1; ``task``: by default ``reach``;
               ``obstacles``; ``seed``; ``max_links``, by default 23
-            - ``statistics``: whether the file has the statistics; ``jobs``: number of processes
+            - ``jobs``: number of processes
 
     Returns:
         The split, or for several sizes a tuple of splits. Its ``train`` and ``test`` robots are
@@ -325,14 +324,10 @@ def split(
         if key not in NewSplit.__optional_keys__:
             valid = NewSplit.__optional_keys__ | {"train", "library"}
             raise BenchmarkError(f"split: unknown argument {key!r}{nearest(key, valid)}")
-    jobs, with_statistics = choice.pop("jobs", 1), choice.pop("statistics", False)
+    jobs = choice.pop("jobs", 1)
     regime, rules, request = _parse(str(name), train, **choice)
     require_split_name(request.name)
     splits = _choose(regime, rules, request, parts, jobs)
-    if with_statistics:
-        splits = tuple(
-            replace(each, statistics=statistics(each, parts, jobs=jobs)) for each in splits
-        )
     loaded = tuple(LoadedSplit(each, parts) for each in splits)
     return loaded[0] if train is None or isinstance(train, Integral) else loaded
 

@@ -32,7 +32,6 @@ from morphgen.rl.runs.training import (
     checkpoint_files,
     default_slice_updates,
     is_done,
-    num_slices,
     require_runnable,
 )
 from morphgen.rl.runs.training import train as train_parts
@@ -98,7 +97,6 @@ def train(
     drawn: str | None = None,
     robot_seed: int | None = None,
     held_out: Sequence[str | Path] = (),
-    slice_updates: int | None = None,
     initial: str | PathLike[str] | None = None,
     constants: Mapping[str, float] | Sequence[str] = (),
     tensorboard: bool = True,
@@ -147,8 +145,6 @@ def train(
         drawn: Numbers of robots to draw from grammars, such as ``arm3:300,chain:300``.
         robot_seed: Seed of the drawn robots, by default 0.
         held_out: Splits whose test robots are never drawn, besides those of morphgen.
-        slice_updates: Number of updates after which the next of the drawn robots take the
-            environments, if there are fewer of these; by default those of two episodes.
         initial: A checkpoint, a run folder or a policy that comes with morphgen, whose networks
             the run begins with.
         constants: Hyperparameters, such as ``{"learning_rate": 1e-4}``, or ``NAME=VALUE`` texts.
@@ -173,14 +169,14 @@ def train(
     """
     given = SimpleNamespace(**locals())
     texts = ("agent", "preset", "sim", "device", "drawn", "goal")
-    least = {"minutes": 1, "robot_seed": 0, "slice_updates": 1, "train_goals": 2, "max_links": 2}
+    least = {"minutes": 1, "robot_seed": 0, "train_goals": 2, "max_links": 2}
     least |= {"steps": 1, "envs": 1, "workers": 1, "seed": 0, "goal_seed": 0}
     require_types(given, TaskError, *texts, **least)
     require_side(on)
     spec = parse_agent(agent)
     if drawn is None:
-        if robot_seed is not None or held_out or slice_updates is not None:
-            raise TaskError("robot_seed, held_out and slice_updates: only with drawn")
+        if robot_seed is not None or held_out:
+            raise TaskError("robot_seed and held_out: only with drawn")
         source: robot_source.Source = robot_source.other_side(named_source(given), on)
     else:
         source = _source_to_draw(given)
@@ -408,13 +404,7 @@ def _with_drawn_robots(
     config: RunConfig, source: robot_source.GrammarSource, given: SimpleNamespace
 ) -> RunConfig:
     """Draw the robots of a run, after all that can be checked before; return its configuration."""
-    if given.slice_updates is not None and num_slices(config) == 1:
-        raise TaskError(
-            f"--slice-updates {given.slice_updates}: {source.name} has an environment for "
-            "every robot at all times"
-        )
-    slice_updates = given.slice_updates or default_slice_updates(config)
-    config = replace(config, slice_updates=slice_updates)
+    config = replace(config, slice_updates=default_slice_updates(config))
     require_runnable(config)
     robots = robot_source.draw(
         source, GoalConfig(tasks=config.tasks), jobs=given.workers or usable_cores()

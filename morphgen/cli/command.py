@@ -61,7 +61,6 @@ class Command:
     """Keyword arguments of ``ArgumentParser.add_argument`` by flag, or name of a position."""
     basic: Sequence[str] = ()
     """Options that ``--help`` shows if ``--help-all`` shows more; empty if there are no others."""
-    alternatives: list[list[str]] = field(default_factory=list)  # flags that exclude each other
     rules: list[tuple[list[str], str, str, list[str]]] = field(default_factory=list)
     """Flags that have an effect ``with`` or ``without`` another only, the other, and those of its
     values that count, all if there are none."""
@@ -133,8 +132,6 @@ def _command(command: Command, lines: Sequence[str], names: Names) -> Command:
             )
         elif line.startswith("$ "):
             command.examples.append(line[2:])
-        elif line.startswith("either "):
-            command.alternatives.append(re.findall(r"--\S+", line))
         elif line == "advanced:":
             command.basic = list(command.options)
         elif line.startswith("-") or help_text:
@@ -393,15 +390,8 @@ def _add_options(parser: Parser, command: Command) -> None:
         parser.add_argument("-h", "--help", action=_BriefHelp, help=text)
         text = "show all options and exit"
         parser.add_argument("--help-all", action=_FullHelp, help=text)
-    exclusive = {
-        name: group
-        for names in command.alternatives
-        for group in [parser.add_mutually_exclusive_group()]
-        for name in names
-    }
     actions = {
-        name: exclusive.get(name, parser).add_argument(name, **settings)
-        for name, settings in command.options.items()
+        name: parser.add_argument(name, **settings) for name, settings in command.options.items()
     }
     if command.basic:
         parser.advanced = [actions[name] for name in actions if name not in command.basic]

@@ -18,7 +18,7 @@ from morphgen.cli.progress import note, status, training_progress
 from morphgen.errors import TaskError, nearest
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import OBSERVATION_SWITCHES, SWITCHES, PPOConfig, parse_agent, parse_agents
-from morphgen.rl.evaluation import EvalConfig, episodes_for
+from morphgen.rl.evaluation import EvalConfig
 from morphgen.rl.runs.checkpoint import RunConfig, read_checkpoint
 from morphgen.rl.runs.robot_source import (
     GrammarSource,
@@ -170,8 +170,6 @@ def study(args: argparse.Namespace) -> int:
 
 def _cells(args: argparse.Namespace) -> list[studies.Cell]:
     """Return the cells of the study, baselines first."""
-    episode_steps = max(config.max_episode_steps for config in default_configs())
-    num_episodes = episodes_for(args.eval_steps, episode_steps)
     sim = evaluation_simulator(args.sim or DEFAULT_SIMULATOR)
     options = SimpleNamespace(**vars(args), seed=0)
     agents, seeds = parse_agents(args.agents or ",".join(AGENTS)), _seeds(args.seeds)
@@ -183,9 +181,9 @@ def _cells(args: argparse.Namespace) -> list[studies.Cell]:
         opt.require_other_name(words, source.name, name)
         sides = tasks_of(source), tasks_of(other_side(source, "test"))
         tasks = training.with_goal(default_configs(), args.goal, chain(*sides))
-        eval_config = EvalConfig(num_episodes, sim, tasks=tasks)
+        eval_config = EvalConfig(args.episodes, sim, tasks=tasks)
         if sim in SIMULATORS.builtin:  # the episodes become submissions, whose number is limited
-            EvalProtocol(sim, num_episodes, goals=GoalConfig(source.goal_seed, tasks))
+            EvalProtocol(sim, args.episodes, goals=GoalConfig(source.goal_seed, tasks))
         cells += studies.baseline_cells(args.out, source, eval_config)
         for label, spec, side in agents:
             config = training.run_config(other_side(source, side), spec, options)

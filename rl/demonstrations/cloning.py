@@ -128,10 +128,6 @@ class DemonstrationBatches:
         """Return False: all steps are there at all times."""
         return False
 
-    def recorded_scores(self, scores: Sequence[float], update: int) -> tuple[float, ...]:
-        """Return no scores: nothing acts."""
-        return ()
-
 
 class Cloner(Learner):
     """A learner whose actor learns the recorded actions, and whose critic their returns."""

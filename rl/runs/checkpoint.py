@@ -336,7 +336,7 @@ class RunConfig:
         if self.max_links < 2:
             raise TaskError(f"--max-links {self.max_links}: expected 2 or more")
         if self.slice_updates < 0:
-            raise TaskError(f"--slice-updates {self.slice_updates}: expected 0 or more")
+            raise TaskError(f"slice_updates {self.slice_updates}: expected 0 or more")
 
     @property
     def num_updates(self) -> int:

@@ -7,7 +7,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -157,12 +157,12 @@ def _require_same(stored: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
 
 
 SLICE_STEPS = 600
-"""Default time that a slice of the robots is trained on [control steps per environment]: two
+"""Time that a slice of the robots is trained on [control steps per environment]: two
 episodes. A new slice cuts running episodes short, and building its environments takes time."""
 
 
 def default_slice_updates(config: RunConfig) -> int:
-    """Return the default of ``RunConfig.slice_updates``: 0 if all drawn robots fit at once.
+    """Return ``RunConfig.slice_updates`` of a new run: 0 if all drawn robots fit at once.
 
     In a short run it is lower than ``SLICE_STEPS``, so that every robot is trained on.
     """
@@ -248,21 +248,6 @@ class TrainingBatches:
         """Return whether a run continues with another batch after so many updates."""
         every = self._config.slice_updates
         return bool(every) and update % every == 0 and update < self._config.num_updates
-
-    def recorded_scores(self, scores: Sequence[float], update: int) -> tuple[float, ...]:
-        """Return the scores to record after an update: those of robots, or means of grammars.
-
-        Thousands of drawn robots would fill the records, and a slice has others than the last.
-        """
-        if self.drawn is None:
-            return tuple(scores)
-        grammars = [member.category for member in self.drawn.members]
-        by_grammar: dict[str, list[float]] = {name: [] for name in grammars}
-        for robot, score in zip(self._robots_at(update - 1), scores, strict=True):
-            by_grammar[grammars[robot]].append(score)
-        return tuple(
-            float(np.mean(values)) if values else math.nan for values in by_grammar.values()
-        )
 
     def _robots_at(self, update: int) -> list[int]:
         """Return the indices of the robots that are trained on after so many updates."""
@@ -446,7 +431,7 @@ def require_runnable(config: RunConfig) -> None:
         raise TaskError(
             f"--steps {config.ppo.total_timesteps} with --envs {config.num_envs}: only "
             f"{slices * config.num_envs} of {robots} robots would be trained on; use more --steps "
-            "or --envs, or a lower --slice-updates"
+            "or --envs"
         )
     config.ppo.minibatch_size(config.num_envs)
 
@@ -538,8 +523,8 @@ def _learn(
         stop.start_clock()
         while not learner.done and not is_stopped:
             metrics = learner.iterate()
-            scores = batches.recorded_scores(metrics.scores, learner.update)
-            metrics = replace(metrics, scores=scores)
+            if batches.drawn:  # thousands would fill the records
+                metrics = replace(metrics, scores=())
             record(metrics)
             if batches.changes_at(learner.update):
                 use_batch(learner, batches.make(learner.update))

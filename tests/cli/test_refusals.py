@@ -137,7 +137,6 @@ train interpolation/arm3/reach --robots cubes:2 => name the task and nothing
 train task=reach --robots chain:3000 --steps 1000 => an update takes
 DRAWN cubes:900 --sim warp => simulator 'warp' on device 'cpu'
 DRAWN cubes:2 --on test => --on test: drawn robots have no sides
-DRAWN cubes:2 --slice-updates 3 => has an environment for every robot
 DRAWN chain:4 --max-links 6 => links, more than max_links 6
 eval nothing => no checkpoint, and no folder of a run
 eval ik => name its robots with --split
@@ -162,7 +161,7 @@ STUDY --agents se,se => is there twice
 STUDY --agents me-tf@test => only se
 STUDY --steps 10 => an update takes
 STUDY --finetune 1000 => --steps 1000 with --envs 64: an update takes 2,048 transitions
-STUDY --eval-steps 4000000 => 13334 episodes
+STUDY --episodes 13334 => 13334 episodes
 study small.yaml again.yaml => again.yaml: split 'mine/small' is also in small.yaml; expected sp
 split score a.json --split some.yaml => a.json: no submission
 play dance prims => see morphgen play --help

@@ -128,14 +128,6 @@ def test_several_train_sizes_write_one_file_each(run, ok):
     assert Path("a-train2.yaml").is_file()
 
 
-def test_statistics_option_adds_statistics(run):
-    run(*INTERPOLATION, "--out", "a.yaml", "--statistics")
-    run(*INTERPOLATION, "--out", "b.yaml")
-    a, b = read_split("a.yaml"), read_split("b.yaml")
-    assert a.statistics["train"]["links"] == 3
-    assert (b.statistics, split_id(b)) == ({}, split_id(a))
-
-
 def test_duplicate_train_robots_are_reported(run):
     Path("two.grammar").write_text(
         "robot -> gantry ee\nee -> @weight(30) plane(size=0.1) | plane(size=0.2)\n"

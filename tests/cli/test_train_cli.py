@@ -51,7 +51,7 @@ def test_single_robot_is_trained_resumed_evaluated_and_played(run, tmp_path):
     assert [line.split()[3] for line in out.splitlines()[2:4]] == ["deterministic", "stochastic"]
     assert "deterministic: MT reach " in out
     assert len((tmp_path / "scores.csv").read_text().splitlines()) == 3
-    words = ("eval", folder / CHECKPOINT, "--steps", "600", "--mode", "stochastic", "--json")
+    words = ("eval", folder / CHECKPOINT, "--episodes", "2", "--mode", "stochastic", "--json")
     (score,) = json.loads(run(*words)[1])["stochastic"]
     assert (score["robot"], score["episodes"], score["steps"]) == ("planar-cube", 2, 600)
     assert score["score"] == pytest.approx(score["raw"] - score["random"])
@@ -220,7 +220,7 @@ def test_interrupted_training_can_be_resumed(run, tmp_path, cache):
 def test_policies_of_a_gpu_are_scored_without_one(run, split_yaml, tmp_path, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     words = ("study", split_yaml, "--agents", "me-mlp", "--seeds", "0", *SMALL)
-    words += ("--steps", "32", "--eval-steps", "300", "--no-tensorboard")
+    words += ("--steps", "32", "--episodes", "1", "--no-tensorboard")
     assert run(*words)[0] == 0
     folder = tmp_path / "study" / "mine" / "small" / "me-mlp" / "seed0"
     table = tmp_path / "study" / "episodes.csv.gz"
@@ -241,7 +241,7 @@ def test_policies_of_a_gpu_are_scored_without_one(run, split_yaml, tmp_path, mon
 @pytest.mark.slow
 def test_study_prints_a_table(run, split_yaml, tmp_path):
     words = ("study", split_yaml, "--agents", "me-mlp,me-mlp-discrete", "--seeds", "0..1", *SMALL)
-    words += ("--steps", "32", "--eval-steps", "300", "--no-tensorboard")
+    words += ("--steps", "32", "--episodes", "1", "--no-tensorboard")
     assert run(*words, "--report")[1].count("- missing: mine/small ") == 8
     assert not list((tmp_path / "study").glob("**/episodes.csv.gz"))
     code, out, err = run(*words)
@@ -252,12 +252,12 @@ def test_study_prints_a_table(run, split_yaml, tmp_path):
         *("me-mlp-discrete", "me-mlp-discrete (stochastic)"),
     ]
     assert run(*words)[:2] == (0, out)
-    assert "of another evaluation" in run(*words, "--eval-steps", "600", "--report")[2]
+    assert "of another evaluation" in run(*words, "--episodes", "2", "--report")[2]
 
 
 def test_failed_study_cell_is_reported_with_exit_code_1(run, split_yaml, tmp_path):
     words = ("study", split_yaml, "--agents", "me-mlp", "--seeds", "0..1", *SMALL)
-    words += ("--steps", "32", "--eval-steps", "300", "--no-tensorboard")
+    words += ("--steps", "32", "--episodes", "1", "--no-tensorboard")
     code, out, _ = run(*words, "--device", "cuda", "--report")  # which needs no GPU
     assert (code, "missing" in out) == (0, True)
     broken = tmp_path / "study" / "mine" / "small" / "me-mlp" / "seed0" / CHECKPOINT
@@ -304,7 +304,7 @@ def test_drawn_robots_are_trained_on_and_others_evaluated_and_played(run, ok, tm
     assert {config.tasks[0].num_goals, config.tasks[1].num_goals} == {3}
     assert [each.name[:-6] for each in robots] == ["cubes-"] * 3 + ["stick-"] * 2
     assert config.source.drawn_hash == json.loads((folder / FILE).read_text())["hash"]
-    assert [len(each["scores"]) for each in read_metrics(folder)] == [2] * 6
+    assert [len(each["scores"]) for each in read_metrics(folder)] == [0] * 6
     again = (*RUN_DRAWN, "cubes:3,stick:2", "--steps", "192", "--resume")
     assert run(*again)[0] == 0
     assert "has another run" in run(*again, "--robot-seed", "1")[2]
