@@ -26,10 +26,10 @@ from tqdm import tqdm
 from morphgen.checks import check
 from morphgen.checks.conformance import conformance
 from morphgen.formats.bundle import read_bundle, write_bundle
-from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.grammar_file import find_grammar, grammar_names, load_grammar
 from morphgen.grammar.library import default_library
 from morphgen.grammar.sampling import sample_robot
+from morphgen.grammar.syntax import Derivation
 
 Counts = tuple[Iterable[int], Iterable[int]]
 """Allowed numbers of links and of movable joints."""

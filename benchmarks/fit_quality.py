@@ -4,7 +4,7 @@
         [--fits one,four] [--jobs 2] [--json rows.json]
 
 Measures every link of every real arm. All methods use the same solid and the measure of
-`morphgen.fitting.quality`. Prints one table per definition of the solid:
+`morphgen.fitting.link_fit`. Prints one table per definition of the solid:
 
 - ``link``: the interior of the link as `morphgen.fitting.solid` defines it.
 - ``as-read``: a mesh's own triangles if trimesh reads the file as a closed surface, else the convex
@@ -44,8 +44,7 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from morphgen.files import write_atomic
-from morphgen.fitting.link_fit import FitOptions, fit_solid
-from morphgen.fitting.quality import quality
+from morphgen.fitting.link_fit import FitOptions, fit_solid, quality
 from morphgen.fitting.solid import Solid, solid_of, solid_of_mesh
 from morphgen.formats.fits import shapes_key
 from morphgen.grammar.library import default_library

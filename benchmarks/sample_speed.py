@@ -26,10 +26,10 @@ from typing import ParamSpec, TypeVar
 
 from tabulate import tabulate
 
-from morphgen.grammar import compose, robot_set, sampling
+from morphgen.grammar import compose, sampling
 from morphgen.grammar import values as conditions
 from morphgen.grammar.grammar_file import find_grammar, grammar_text, load_grammar
-from morphgen.grammar.robot_set import SetConfig, make_set
+from morphgen.grammar.sampling import SetConfig, make_set
 from morphgen.progress import show_progress
 
 P = ParamSpec("P")
@@ -42,7 +42,7 @@ STEPS = (
     (sampling, "survey_contacts", "collision survey"),
     (sampling, "check", "check"),
     (conditions, "reach", "reach"),
-    (robot_set, "_write_light", "write"),
+    (sampling, "write_light", "write"),
 )
 """Module and name of each measured function, and its step. Nested steps are counted once."""
 

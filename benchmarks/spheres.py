@@ -5,7 +5,7 @@
 
 Fits spheres to the collision meshes of every link: once for the largest intersection over union
 (IoU), once so that they cover a share of the link. All sets are measured on the same solids by
-`morphgen.fitting.quality`; a row has the means over the links of an arm:
+`morphgen.fitting.link_fit`; a row has the means over the links of an arm:
 
 - spheres: their number in the whole arm.
 - IoU, coverage, volume: of the union of spheres and the solid, volume over that of the solid.
@@ -40,7 +40,7 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from fit_quality import FOUR, Task, link_tasks
-from morphgen.fitting.quality import quality
+from morphgen.fitting.link_fit import quality
 from morphgen.fitting.search import best_spheres, sample_solid
 from morphgen.fitting.solid import Solid, solid_of
 from morphgen.model.geometry import Pose, Shape, Sphere

@@ -10,12 +10,12 @@ from helpers.grammars import LIBRARY
 from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import CompositionError, nearest
-from morphgen.fitting.quality import signed_distance
+from morphgen.fitting.link_fit import signed_distance
 from morphgen.formats.urdf.read import read_urdf
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar.compose import compose
-from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.request import parse_request, parse_words
+from morphgen.grammar.syntax import Derivation
 from morphgen.model.geometry import Cylinder, Pose, Shape
 from morphgen.model.inertia import bounding_box
 from morphgen.model.robot import Inertial, Joint, Link, Robot

@@ -17,8 +17,8 @@ from morphgen.formats.data_files import read_json
 from morphgen.formats.description import SUFFIXES, is_mjcf
 from morphgen.grammar.catalogue import known_facts, stored_facts
 from morphgen.grammar.library import Library
-from morphgen.grammar.robot_set import INDEX, read_index, read_settings
 from morphgen.grammar.robot_source import is_robot_folder
+from morphgen.grammar.sampling import INDEX, read_index, read_settings
 from morphgen.splits.split import Split, sided_members
 from morphgen.viewer import robot_uri
 

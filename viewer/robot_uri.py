@@ -35,11 +35,11 @@ from morphgen.formats.mjcf.document import read_document
 from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar.compose import compose
-from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.grammar_file import SUFFIX, Grammar, find_grammar, load_grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.request import default_name, parse_words
 from morphgen.grammar.robot_source import RobotReference, light_derivation, read_source
+from morphgen.grammar.syntax import Derivation, parse_derivation
 from morphgen.model.robot import Robot
 from morphgen.splits.split import SIDES, Member, Side, Split, compose_member
 from morphgen.splits.split_file import find_split, read_split_file, split_names

@@ -8,9 +8,9 @@ from tempfile import TemporaryDirectory
 
 from morphgen import checks
 from morphgen.checks.conformance import ConformanceReport, compare, compare_file, hold_files
+from morphgen.checks.readers import loader_copy
 from morphgen.checks.rules import home_penetrations
 from morphgen.formats.bundle import CARD, bundle_folder, file_findings, read_bundle, write_bundle
-from morphgen.formats.gate import loader_copy
 from morphgen.formats.resolve import default_finder
 from morphgen.formats.urdf.read import UnsoundError
 from morphgen.grammar.library import Library, LibraryFolders, default_library

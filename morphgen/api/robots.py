@@ -25,7 +25,7 @@ from morphgen.model.geometry import MESH_SUFFIXES, Mesh, Shape
 from morphgen.model.robot import Link, Robot
 
 if TYPE_CHECKING:
-    from morphgen.fitting.fitted_robot import FittedRobot
+    from morphgen.fitting.replace_collision import FittedRobot
 
 
 @explain_missing_extras()
@@ -188,7 +188,6 @@ def fit(
     iou: float = 0.9,
     spheres: int | None = None,
     cover: float | None = None,
-    visual: bool = False,
     seed: int = 0,
     jobs: int = 1,
     library: LibraryFolders = (),
@@ -210,7 +209,6 @@ def fit(
         spheres: Number of spheres per link, 1 to 32, for a fit with spheres alone.
         cover: Share of a link's volume that its spheres must cover, such as 0.995; by default they
             have the largest intersection over union.
-        visual: Replace the visual shapes, too.
         seed: Seed of the sample points.
         jobs: Number of processes; the result does not depend on it.
         library: Folders of your own parts.
@@ -224,8 +222,8 @@ def fit(
         MissingDependencyError: If the extra ``fit`` is not installed.
         MorphgenError: If the robot cannot be composed or read.
     """
-    from morphgen.fitting.fitted_robot import fit_robot
     from morphgen.fitting.link_fit import FitOptions
+    from morphgen.fitting.replace_collision import fit_robot
 
     options = FitOptions(max_primitives, iou, seed, spheres, cover)
     parts = default_library(library)
@@ -233,4 +231,4 @@ def fit(
         path = Path(robot)
         robot = Robot(path.stem, (Link(path.stem, collisions=(Shape(Mesh(path)),)),), ())
     target = resolve_robot(robot, parts)
-    return fit_robot(target, options, parts.folders, visual=visual, jobs=jobs)
+    return fit_robot(target, options, parts.folders, jobs=jobs)

@@ -17,8 +17,8 @@ from morphgen.encoding.tokens import default_max_links, require_max_links
 from morphgen.errors import BenchmarkError, TaskError
 from morphgen.formats.description import SUFFIXES
 from morphgen.grammar.library import LibraryFolders, library_folders
-from morphgen.grammar.robot_set import GRAMMAR
 from morphgen.grammar.robot_source import is_robot_folder, is_set_folder
+from morphgen.grammar.sampling import GRAMMAR
 from morphgen.processes import usable_cores
 from morphgen.progress import note
 from morphgen.rl.agents import AGENTS, ME_GRAPH, preset_of

@@ -16,10 +16,10 @@ from morphgen.benchmark.regimes import HULLS, RuledRobot, pattern_robots, regime
 from morphgen.encoding.similarity import is_near
 from morphgen.encoding.tokens import MAX_LINKS, require_max_links
 from morphgen.errors import BenchmarkError, nearest
-from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import RandomChooser, TooManyPartsError, derive
 from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
+from morphgen.grammar.syntax import Derivation
 from morphgen.processes import parallel_map
 from morphgen.progress import report, show_progress
 from morphgen.splits.candidates import (

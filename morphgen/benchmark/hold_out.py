@@ -28,10 +28,10 @@ from morphgen.benchmark.generate import (
 from morphgen.benchmark.regimes import NOTHING, found, parts, pattern_robots
 from morphgen.encoding.similarity import is_near
 from morphgen.errors import BenchmarkError, nearest
-from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import PART_KINDS, Manifest
+from morphgen.grammar.syntax import Derivation, parse_derivation
 from morphgen.model.findings import Finding
 from morphgen.processes import parallel_map
 from morphgen.progress import part_of, report, stage

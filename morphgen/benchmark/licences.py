@@ -18,8 +18,8 @@ import yaml
 from morphgen.benchmark.regimes import parts as part_names
 from morphgen.benchmark.texts import read_text
 from morphgen.errors import BenchmarkError, nearest
-from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
+from morphgen.grammar.syntax import parse_derivation
 from morphgen.splits.split import SIDES, Split, sided_members
 
 LICENCES_FILE = "licences.json"

@@ -19,10 +19,10 @@ import scipy  # loads its packages at their first use, which take seconds
 from numpy.typing import ArrayLike
 
 from morphgen.errors import BenchmarkError, CompositionError, nearest
-from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import MOUNT_YAW
 from morphgen.grammar.request import SLOTS
+from morphgen.grammar.syntax import Derivation, parse_derivation
 from morphgen.model.findings import Finding, texts_of
 from morphgen.splits.candidates import Candidate, DerivedRecipe, recipe_of
 from morphgen.splits.split import COMPOSED, Member, Regime, Split

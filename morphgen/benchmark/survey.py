@@ -22,8 +22,8 @@ from morphgen.errors import BenchmarkError, MorphgenError, nearest
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.rounding import round_number
 from morphgen.grammar.compose import compose
-from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
+from morphgen.grammar.syntax import parse_derivation
 from morphgen.grammar.values import RobotProperties
 from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map

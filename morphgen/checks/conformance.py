@@ -28,11 +28,11 @@ from morphgen.checks.readers import (
     Reading,
     bullet_client,
     load_model,
+    loader_copy,
 )
 from morphgen.errors import FormatError, MorphgenError, one_line
 from morphgen.formats.bundle import MJCF, URDF, read_bundle
 from morphgen.formats.description import read_description
-from morphgen.formats.gate import loader_copy
 from morphgen.formats.quiet import MujocoWarnings, quiet
 from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS

@@ -14,9 +14,8 @@ from morphgen.checks import check
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, print_line, status, track
 from morphgen.errors import FitError, FormatError, MorphgenError
-from morphgen.fitting.fitted_robot import fit_robot
-from morphgen.fitting.link_fit import FitOptions, LinkFit, fit_shapes
-from morphgen.fitting.quality import Quality
+from morphgen.fitting.link_fit import FitOptions, LinkFit, Quality, fit_shapes
+from morphgen.fitting.replace_collision import fit_robot
 from morphgen.fitting.robot_fit import FitReport, parts_with_meshes, store_parts
 from morphgen.formats.bundle import bundle_folder, require_replaceable, write_bundle
 from morphgen.grammar.part import load_part
@@ -140,7 +139,7 @@ def _fit_robot(
     source, robot = target
     folders = opt.library_of(args).folders
     with bar(args, f"fitting {source.label if source else robot.name}", "link"):
-        fit = fit_robot(robot, options, folders, visual=args.visual, jobs=args.jobs)
+        fit = fit_robot(robot, options, folders, jobs=args.jobs)
     report = fit.report
     if not args.json:
         with opt.fit_terminal(args):

@@ -20,7 +20,7 @@ from morphgen.grammar.grammar_file import (
     grammar_text,
     load_grammar,
 )
-from morphgen.grammar.robot_set import SetConfig, make_set
+from morphgen.grammar.sampling import SetConfig, make_set
 from morphgen.grammar.syntax import COUNT_DIGITS, MAX_COUNT
 from morphgen.grammar.values import parse_conditions
 

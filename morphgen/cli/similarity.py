@@ -28,8 +28,8 @@ from morphgen.encoding.tokens import tokens as encode
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.files import require_writable_file, write_file
-from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
+from morphgen.grammar.syntax import parse_derivation
 from morphgen.model.robot import Robot
 from morphgen.progress import part_of
 from morphgen.tables import fits, fitted, is_whole, table

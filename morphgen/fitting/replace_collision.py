@@ -15,7 +15,8 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     import trimesh
 
     from morphgen.fitting.link_fit import FitOptions
+    from morphgen.fitting.robot_fit import FitReport
 
 _LOGGER = logging.getLogger(__name__)
 SPHERES = 8  # default number of spheres per link
@@ -203,29 +205,24 @@ def with_fits(robot: Robot, fits: Mapping[str, StoredFit]) -> Robot:
     return replace(robot, fits={shapes_key(fit.collision): fit for fit in fits_at_scale})
 
 
-def with_primitives(
-    robot: Robot, primitives: Mapping[str, Sequence[Shape]], *, visual: bool = False
-) -> Robot:
+def with_primitives(robot: Robot, primitives: Mapping[str, Sequence[Shape]]) -> Robot:
     """Return the robot with other collision primitives by link, numbers rounded as in a file.
 
     The pairs whose contacts are ignored are determined again. A link without an entry keeps its
     collision shapes if they are primitives, and loses them if they are meshes.
     """
-    links = tuple(_with_collision(link, primitives.get(link.name), visual) for link in robot.links)
+    links = tuple(
+        replace(link, collisions=_collisions(link, primitives.get(link.name)))
+        for link in robot.links
+    )
     fitted = as_written(replace(robot, links=links, ignore_pairs=()))
     return replace(fitted, ignore_pairs=survey_collisions(fitted).ignore_pairs)
 
 
-def _with_collision(link: Link, shapes: Sequence[Shape] | None, visual: bool) -> Link:
+def _collisions(link: Link, shapes: Sequence[Shape] | None) -> tuple[Shape, ...]:
     if shapes is None:
         shapes = () if has_meshes(link.collisions) else link.collisions
-    rgba = link.visuals[0].rgba if link.visuals else None
-    coloured = tuple(replace(shape, rgba=rgba) for shape in shapes)
-    return replace(
-        link,
-        collisions=tuple(shapes) if link.collisions else (),
-        visuals=coloured if visual and link.visuals and shapes else link.visuals,
-    )
+    return tuple(shapes) if link.collisions else ()
 
 
 def stored_primitives(
@@ -245,6 +242,48 @@ def _known_fits(robot: Robot, stored: StoredFits) -> dict[str, StoredFit]:
     """Return the fits that the robot carries or that are stored, by link name."""
     fits = {link.name: find_fit(link.collisions, robot, stored) for link in robot.links}
     return {name: fit for name, fit in fits.items() if fit}
+
+
+@dataclass(frozen=True)
+class FittedRobot:
+    """A fit of primitives to a robot."""
+
+    source: Robot
+    """The robot whose shapes were fitted."""
+    report: FitReport
+    """The primitives of each link, and their measured quality."""
+    folders: tuple[Path, ...] = ()
+    """Folders of parts, for their stored fits."""
+
+    @cached_property
+    def robot(self) -> Robot:
+        """The same robot with the primitives as its collision shapes, made at the first access.
+
+        Its provenance has the report without durations.
+
+        Raises:
+            MeshError: If a mesh cannot be read.
+            RobotError: If a joint axis is zero.
+        """
+        from morphgen.fitting.robot_fit import fits_of
+
+        primitives = {row.link: row.fit.primitives for row in self.report.links}
+        fits = fits_of(self.source, self.report, read_stored_fits(self.folders))
+        fitted = with_fits(with_primitives(self.source, primitives), fits)
+        provenance = {**self.source.provenance, "primitives": self.report.without_times()}
+        return replace(fitted, provenance=provenance)
+
+
+def fit_robot(
+    robot: Robot, options: FitOptions, folders: tuple[Path, ...] = (), *, jobs: int = 1
+) -> FittedRobot:
+    """Fit primitives to a robot's links."""
+    from morphgen.fitting.robot_fit import fit_links  # needs the extra fit
+
+    if not any(link.solid_shapes for link in robot.links):
+        raise FitError(f"robot {robot.name!r}: no link has a shape")
+    report = fit_links(robot, options, jobs=jobs)
+    return FittedRobot(robot, report, folders)
 
 
 MAX_PIECES = 16  # largest number of convex pieces of one mesh

@@ -11,8 +11,7 @@ from typing import cast
 import numpy as np
 
 from morphgen.errors import FitError
-from morphgen.fitting.link_fit import FitOptions, LinkFit, fit_shapes
-from morphgen.fitting.quality import Quality, quality
+from morphgen.fitting.link_fit import FitOptions, LinkFit, Quality, fit_shapes, quality
 from morphgen.fitting.solid import Solid, solid_of
 from morphgen.fitting.token_shapes import token_of_primitives
 from morphgen.formats import fits as fit_files

@@ -11,7 +11,6 @@ from itertools import islice
 from morphgen.errors import CompositionError, GrammarError
 from morphgen.grammar import values
 from morphgen.grammar.compose import require_root
-from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import (
     Chooser,
     DeriveCache,
@@ -29,7 +28,15 @@ from morphgen.grammar.grammar_file import Grammar, find_grammar, load_grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import MOUNT_YAW
 from morphgen.grammar.part import load_part
-from morphgen.grammar.syntax import MAX_COUNT, MAX_FAULTS, MAX_PARTS, MAX_SEARCH, Alternative, Item
+from morphgen.grammar.syntax import (
+    MAX_COUNT,
+    MAX_FAULTS,
+    MAX_PARTS,
+    MAX_SEARCH,
+    Alternative,
+    Derivation,
+    Item,
+)
 
 _MANY = MAX_COUNT + 1  # stands for any larger number of structures
 

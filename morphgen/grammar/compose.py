@@ -10,10 +10,10 @@ from morphgen.checks.self_collision import CollisionSurvey, survey_collisions
 from morphgen.errors import CompositionError, nearest
 from morphgen.files import kept
 from morphgen.formats.fits import with_stored_fits
-from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import MOUNT_YAW, MOUNT_YAW_PARAMETER, require_range
 from morphgen.grammar.part import Part, load_part
+from morphgen.grammar.syntax import Derivation
 from morphgen.model.geometry import IDENTITY, Mesh, Pose
 from morphgen.model.mesh import mesh_key
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Pair, Robot, sorted_pair

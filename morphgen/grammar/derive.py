@@ -10,11 +10,10 @@ import numpy as np
 
 from morphgen.errors import GrammarError, PartError, nearest
 from morphgen.formats.rounding import format_number
-from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import MOUNT_YAW, Manifest, Parameter, require_range
-from morphgen.grammar.syntax import MAX_PARTS, Alternative, Expression, Item, Production
+from morphgen.grammar.syntax import MAX_PARTS, Alternative, Derivation, Expression, Item, Production
 from morphgen.grammar.values import Distribution, Scope, evaluate, typical_value
 from morphgen.model.tree import take_name
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 from morphgen.errors import CompositionError, GrammarError, nearest
 from morphgen.grammar import syntax
 from morphgen.grammar.analysis import load_sound_grammar
-from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.derive import Chooser, derive
 from morphgen.grammar.grammar_file import SUFFIX, Grammar, grammar_names
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import MOUNT_YAW, Manifest, PartKind, parse_value, resolve_values
+from morphgen.grammar.syntax import Derivation
 from morphgen.grammar.values import Scope, evaluate, typical_value
 
 

@@ -17,12 +17,11 @@ from morphgen.formats.data_files import read_text
 from morphgen.formats.description import SUFFIXES, read_description
 from morphgen.formats.resolve import default_finder
 from morphgen.grammar.compose import compose
-from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.grammar_file import SUFFIX as GRAMMAR_SUFFIX
 from morphgen.grammar.library import Library
 from morphgen.grammar.request import known_grammars, parse_words
-from morphgen.grammar.robot_set import DERIVATION, INDEX, SETTINGS, read_index
-from morphgen.grammar.syntax import MAX_DERIVATION_TEXT
+from morphgen.grammar.sampling import DERIVATION, INDEX, SETTINGS, read_index
+from morphgen.grammar.syntax import MAX_DERIVATION_TEXT, Derivation, parse_derivation
 from morphgen.model.robot import TOOL, Frame, Robot
 from morphgen.model.tree import rename, subtree
 

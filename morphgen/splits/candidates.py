@@ -12,11 +12,11 @@ from morphgen.encoding.tokens import MAX_LINKS, require_max_links
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.compose import compose, join
-from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.grammar_file import Grammar, grammar_names
 from morphgen.grammar.library import Library
 from morphgen.grammar.request import parse_words
 from morphgen.grammar.sampling import sample_robot
+from morphgen.grammar.syntax import Derivation, parse_derivation
 from morphgen.model.robot import Robot
 from morphgen.splits.split import COMPOSED, Member
 

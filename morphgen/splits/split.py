@@ -15,8 +15,8 @@ from morphgen.encoding.robot_hash import digest, robot_hash
 from morphgen.encoding.tokens import LARGEST_MAX_LINKS, MAX_LINKS
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.compose import compose
-from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import Library
+from morphgen.grammar.syntax import parse_derivation
 from morphgen.model.robot import Robot
 
 Regime = Literal["interpolation", "composition", "extrapolation", "hold-out"]
@@ -40,7 +40,7 @@ class Member:
 
     name: str  # name of the robot, unique on each side of the split
     category: str  # grammar that the robot was sampled from, or `composed`
-    derivation: str  # parts and parameters of the robot, see `morphgen.grammar.derivation`
+    derivation: str  # parts and parameters of the robot, see `morphgen.grammar.syntax`
     task: str  # name of the task; the tasks package knows which tasks exist
     obstacles: bool  # the scene has obstacles
     robot_hash: str

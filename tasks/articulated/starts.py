@@ -18,9 +18,9 @@ from morphgen.formats.rounding import as_written
 from morphgen.formats.urdf.read import robot_from_xml
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar.compose import compose
-from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.library import default_library
 from morphgen.grammar.manifest import Manifest
+from morphgen.grammar.syntax import Derivation
 from morphgen.model.geometry import Mesh, Pose
 from morphgen.model.kinematics import joint_limits, solve_position_ik
 from morphgen.model.robot import TOOL, Robot

@@ -21,9 +21,9 @@ from morphgen.encoding.similarity import MEASURES, NearThresholds, features, is_
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.compose import compose
-from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.sampling import sample_robot
+from morphgen.grammar.syntax import Derivation
 from morphgen.progress import show_progress
 from morphgen.splits.split_file import split_names
 

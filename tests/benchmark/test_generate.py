@@ -26,8 +26,8 @@ from morphgen.benchmark.regimes import (
 )
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import BenchmarkError
-from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.request import parse_words
+from morphgen.grammar.syntax import parse_derivation
 from morphgen.model.findings import Finding
 from morphgen.progress import show_progress
 from morphgen.splits import candidates

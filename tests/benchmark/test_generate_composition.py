@@ -15,7 +15,7 @@ from morphgen.benchmark.generate import (
 )
 from morphgen.benchmark.regimes import RuledRobot, expand, regime_findings, structure
 from morphgen.errors import BenchmarkError, CompositionError, PartError
-from morphgen.grammar.derivation import Derivation, parse_derivation
+from morphgen.grammar.syntax import Derivation, parse_derivation
 
 pytestmark = pytest.mark.usefixtures("composed_once")
 

@@ -18,8 +18,8 @@ from morphgen.benchmark.hold_out import (
 )
 from morphgen.benchmark.regimes import pattern_robots
 from morphgen.errors import BenchmarkError, CompositionError, PartError
-from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.request import parse_words
+from morphgen.grammar.syntax import parse_derivation
 from morphgen.progress import show_progress
 from morphgen.splits.candidates import RobotFactory
 from morphgen.splits.split import Member, compose_member, split_id

@@ -13,7 +13,7 @@ from helpers.commands import tree
 from helpers.parts import write_part
 from helpers.robots import arm
 from morphgen.checks.srdf import read_srdf
-from morphgen.fitting.quality import Quality
+from morphgen.fitting.link_fit import Quality
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.formats.urdf.read import read_urdf
 from morphgen.grammar.library import default_library
@@ -38,7 +38,7 @@ def test_part_made_of_primitives_keeps_them(run, ok):
 
 
 def test_a_bundle_with_a_picture_may_have_the_name_of_its_part(ok):
-    out = ok("fit", "plane", "--out", "plane", "--visual")
+    out = ok("fit", "plane", "--out", "plane")
     assert out.splitlines()[-1] == "plane"
     assert Path("plane/preview.png").is_file()
     ok("check", "plane/")

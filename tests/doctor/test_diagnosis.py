@@ -32,8 +32,7 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import LIBRARY_VARIABLE, default_library
 from morphgen.grammar.request import parse_words
-from morphgen.grammar.robot_set import SetConfig
-from morphgen.grammar.sampling import sample_robot
+from morphgen.grammar.sampling import SetConfig, sample_robot
 from morphgen.model.dynamics import GRAVITY
 from morphgen.rl.demonstrations import lerobot
 from morphgen.rl.evaluation import EvalConfig, evaluate_baseline

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from morphgen.fitting.canonical import canonical
-from morphgen.fitting.quality import signed_distance
+from morphgen.fitting.link_fit import signed_distance
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
 
 KINDS = [Box((0.3, 0.2, 0.4)), Cylinder(0.15, 0.3), Sphere(0.2), Capsule(0.1, 0.25)]

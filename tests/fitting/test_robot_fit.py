@@ -13,8 +13,7 @@ from morphgen.cli import main
 from morphgen.errors import FitError, FormatError
 from morphgen.fitting import robot_fit
 from morphgen.fitting import token_shapes as token_shapes_module
-from morphgen.fitting.link_fit import FitOptions, fit_shapes
-from morphgen.fitting.quality import quality
+from morphgen.fitting.link_fit import FitOptions, fit_shapes, quality
 from morphgen.fitting.replace_collision import (
     as_primitives,
     stored_primitives,
@@ -125,18 +124,6 @@ def test_fitted_capsules_survive_a_bundle(tmp_path, wedge):
     read = read_bundle(write_bundle(robot, tmp_path / "made", picture=False))
     assert as_written(read).link("l0").collisions == robot.link("l0").collisions
     assert token_shapes(read) == {"l0": token}
-
-
-def test_visuals_are_replaced_on_request(tmp_path, wedge):
-    shape = mesh_shape(tmp_path, wedge)
-    robot = arm([shape])
-    visuals = (dataclasses.replace(shape, rgba=(1, 0, 0, 1)),)
-    seen = dataclasses.replace(robot.links[0], visuals=visuals)
-    robot = dataclasses.replace(robot, links=(seen,))
-    box = (Shape(Box((0.1, 0.1, 0.1))),)
-    assert with_primitives(robot, {"l0": box}).links[0].visuals == seen.visuals
-    replaced = with_primitives(robot, {"l0": box}, visual=True).links[0]
-    assert replaced.visuals == (dataclasses.replace(box[0], rgba=(1, 0, 0, 1)),)
 
 
 def test_links_without_stored_fits_are_fitted_once(tmp_path, monkeypatch, caplog):

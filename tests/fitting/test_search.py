@@ -14,8 +14,7 @@ from helpers.robots import arm
 from morphgen.errors import FitError
 from morphgen.fitting import search
 from morphgen.fitting.canonical import KINDS
-from morphgen.fitting.link_fit import FitOptions, fit_shapes
-from morphgen.fitting.quality import quality, signed_distance
+from morphgen.fitting.link_fit import FitOptions, fit_shapes, quality, signed_distance
 from morphgen.fitting.replace_collision import as_spheres, has_only_spheres, link_spheres
 from morphgen.fitting.solid import solid_of, solid_of_mesh
 from morphgen.fitting.token_shapes import token_shapes

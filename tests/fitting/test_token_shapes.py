@@ -10,7 +10,7 @@ import trimesh
 import morphgen
 from morphgen.errors import FormatError
 from morphgen.fitting import token_shapes as module
-from morphgen.fitting.quality import quality
+from morphgen.fitting.link_fit import quality
 from morphgen.fitting.solid import solid_of
 from morphgen.fitting.token_shapes import fit_composite, token_shapes
 from morphgen.grammar.library import default_library

@@ -18,9 +18,9 @@ from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import CompositionError, PartError
 from morphgen.formats.bundle import read_bundle, write_bundle
 from morphgen.grammar.compose import compose, join, load_parts
-from morphgen.grammar.derivation import Derivation
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import default_name
+from morphgen.grammar.syntax import Derivation
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import forward_kinematics, frame_pose, random_configurations
 from morphgen.model.robot import Inertial

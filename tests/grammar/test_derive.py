@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from helpers.grammars import LIBRARY, grammar, shipped
 from morphgen.errors import GrammarError, MorphgenError
-from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.derive import (
     Chooser,
     RandomChooser,
@@ -16,7 +15,7 @@ from morphgen.grammar.derive import (
 )
 from morphgen.grammar.request import default_name, parse_request, parse_words, pin
 from morphgen.grammar.sampling import sample_robots
-from morphgen.grammar.syntax import MAX_PARTS
+from morphgen.grammar.syntax import MAX_PARTS, Derivation, parse_derivation
 
 
 def first(*lines):

@@ -14,10 +14,15 @@ from morphgen.grammar.analysis import (
     count_structures,
     enumerate_structures,
 )
-from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.derive import Chooser, RandomChooser, derive
 from morphgen.grammar.grammar_file import grammar_text, load_grammar
-from morphgen.grammar.syntax import MAX_COUNT, MAX_NESTING, MAX_PARTS, parse_condition
+from morphgen.grammar.syntax import (
+    MAX_COUNT,
+    MAX_NESTING,
+    MAX_PARTS,
+    parse_condition,
+    parse_derivation,
+)
 
 SOON = 10.0
 """CPU seconds."""

@@ -22,21 +22,24 @@ from morphgen.checks import check
 from morphgen.checks.conformance import conformance
 from morphgen.errors import FormatError, MorphgenError
 from morphgen.formats.bundle import read_bundle, write_bundle
-from morphgen.grammar import robot_set, sampling
+from morphgen.grammar import sampling
 from morphgen.grammar.analysis import check_grammar, count_structures
 from morphgen.grammar.derive import RandomChooser, derive
 from morphgen.grammar.grammar_file import grammar_from_text, grammar_text
-from morphgen.grammar.robot_set import (
+from morphgen.grammar.sampling import (
     GRAMMAR,
     INDEX,
     JOURNAL,
     SETTINGS,
     RobotMaker,
+    Sample,
+    SamplingError,
     SetConfig,
     make_set,
     read_index,
+    sample_robot,
+    sample_robots,
 )
-from morphgen.grammar.sampling import Sample, SamplingError, sample_robot, sample_robots
 from morphgen.grammar.syntax import parse_condition
 from morphgen.progress import show_progress
 
@@ -225,7 +228,7 @@ def stopped(config, n, done, error):
         raise error
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(robot_set, "parallel_map", limited)
+        patch.setattr(sampling, "parallel_map", limited)
         with pytest.raises(type(error)):
             make_set(config, n)
 

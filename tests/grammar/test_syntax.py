@@ -33,8 +33,7 @@ from morphgen.grammar.grammar_file import (
 )
 from morphgen.grammar.manifest import UNITS
 from morphgen.grammar.request import parse_request, pin
-from morphgen.grammar.robot_set import SetConfig, make_set
-from morphgen.grammar.sampling import sample_robots
+from morphgen.grammar.sampling import SetConfig, make_set, sample_robots
 from morphgen.grammar.syntax import (
     Expression,
     Include,

@@ -2,8 +2,8 @@
 
 from morphgen.benchmark.generate import SplitRequest
 from morphgen.benchmark.regimes import regime_findings
-from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import default_library
+from morphgen.grammar.syntax import parse_derivation
 from morphgen.splits.split import compose_member
 
 LIBRARY = default_library()

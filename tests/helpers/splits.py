@@ -2,9 +2,9 @@
 
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.grammar.compose import compose
-from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
+from morphgen.grammar.syntax import parse_derivation
 from morphgen.splits.split import COMPOSED, Member, Split
 
 LIBRARY = default_library()

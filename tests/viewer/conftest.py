@@ -9,7 +9,7 @@ from helpers.robots import arm
 from morphgen.formats.bundle import write_bundle
 from morphgen.grammar.grammar_file import find_grammar, grammar_text, load_grammar
 from morphgen.grammar.library import default_library
-from morphgen.grammar.robot_set import SetConfig, make_set
+from morphgen.grammar.sampling import SetConfig, make_set
 from morphgen.viewer.app.app import serve
 from morphgen.viewer.robot_uri import FileAccess
 

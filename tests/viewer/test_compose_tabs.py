@@ -5,9 +5,9 @@ from urllib.parse import unquote
 import pytest
 
 from helpers.viser_client import PlainClient
-from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
+from morphgen.grammar.syntax import parse_derivation
 from morphgen.viewer.pages import compose as pages
 
 LIBRARY = default_library()

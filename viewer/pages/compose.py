@@ -20,14 +20,13 @@ from morphgen.errors import CompositionError, MorphgenError
 from morphgen.formats.bundle import bundle_folder, split_colours, write_bundle
 from morphgen.formats.rounding import format_number
 from morphgen.grammar.compose import compose
-from morphgen.grammar.derivation import Derivation, parse_derivation
 from morphgen.grammar.derive import Chooser, derive
 from morphgen.grammar.grammar_file import SUFFIX, grammar_from_text, grammar_names, grammar_text
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import Parameter, PartKind, parse_value
 from morphgen.grammar.request import MAIN_PORTS, SLOTS, default_name, known_grammars, parse_request
-from morphgen.grammar.robot_set import GRAMMAR
-from morphgen.grammar.sampling import sample_robot
+from morphgen.grammar.sampling import GRAMMAR, sample_robot
+from morphgen.grammar.syntax import Derivation, parse_derivation
 from morphgen.model.inertia import box_corners
 from morphgen.model.kinematics import arm_reach
 from morphgen.model.robot import Robot

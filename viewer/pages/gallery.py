@@ -17,8 +17,8 @@ from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.bundle import PICTURE
 from morphgen.grammar.compose import compose
-from morphgen.grammar.derivation import parse_derivation
 from morphgen.grammar.grammar_file import grammar_names
+from morphgen.grammar.syntax import parse_derivation
 from morphgen.rl.demonstrations.lerobot import RECORDING
 from morphgen.splits.split import COMPOSED, HOLD_OUT, REGIMES, SIDES, Member, Regime, Split
 from morphgen.splits.split_file import require_split_name, split_names, write_split
