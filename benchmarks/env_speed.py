@@ -60,7 +60,7 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from morphgen.processes import one_torch_thread
-from morphgen.splits.split_file import read_split
+from morphgen.splits.split import read_split
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.configs import ReachConfig

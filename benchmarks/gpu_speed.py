@@ -34,7 +34,7 @@ from tabulate import tabulate
 
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.ppo import Learner
-from morphgen.splits.split_file import read_split
+from morphgen.splits.split import read_split
 from morphgen.tasks.batch import StepGraph, TaskBatch
 from morphgen.tasks.observation import observation_config
 from morphgen.tasks.scenes.make import make_batch, make_split_batch

@@ -23,8 +23,7 @@ from morphgen.files import write_atomic
 from morphgen.grammar.library import Library, default_library
 from morphgen.processes import parallel_map
 from morphgen.progress import show_progress
-from morphgen.splits.split import Member, sided_members
-from morphgen.splits.split_file import read_split, split_names
+from morphgen.splits.split import Member, read_split, sided_members, split_names
 from morphgen.tasks.goals.goal_sets import FOLDER, INDEX, packaged_index, set_npz
 from morphgen.tasks.goals.split_goals import certify_goal_set
 from morphgen.tasks.registry import TASKS

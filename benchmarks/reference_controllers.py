@@ -38,8 +38,7 @@ from morphgen.processes import parallel_map
 from morphgen.rl.baselines import BASELINES, baselines_for
 from morphgen.rl.baselines.simple import Zero
 from morphgen.rl.inference import run_episodes
-from morphgen.splits.split import SIDES, Member
-from morphgen.splits.split_file import read_split, split_names
+from morphgen.splits.split import SIDES, Member, read_split, split_names
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.configs import ReachConfig
 from morphgen.tasks.registry import GOAL_KINDS, TASKS, installed_simulators

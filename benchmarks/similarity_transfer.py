@@ -48,9 +48,7 @@ from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.files import write_atomic
 from morphgen.grammar.library import Library, default_library
 from morphgen.rl.runs.robot_source import read_drawn
-from morphgen.splits.candidates import RobotFactory, recipe_of
-from morphgen.splits.split import Member, Split
-from morphgen.splits.split_file import read_split
+from morphgen.splits.split import Member, RobotFactory, Split, read_split, recipe_of
 from morphgen.typing import Array
 from robot_curve import REAL_ARMS, VARIANTS, policy_name, read_scores
 

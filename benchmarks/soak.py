@@ -23,8 +23,7 @@ from tqdm import tqdm
 from env_speed import random_actions
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.grammar.library import default_library
-from morphgen.splits.split import compose_side
-from morphgen.splits.split_file import read_split
+from morphgen.splits.split import compose_side, read_split
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.registry import SIMULATORS
 from morphgen.tasks.scenes.make import make_batch

@@ -20,14 +20,13 @@ from typing import TypeVar
 from tabulate import tabulate
 from tqdm import tqdm
 
-from morphgen.benchmark.audit import audit
 from morphgen.benchmark.generate import SplitRequest, extrapolation
 from morphgen.benchmark.release import verify
 from morphgen.benchmark.split_folder import build_split
+from morphgen.benchmark.survey import audit
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import default_library
-from morphgen.splits.split import Split
-from morphgen.splits.split_file import split_text, write_split
+from morphgen.splits.split import Split, split_text, write_split
 
 T = TypeVar("T")
 

@@ -13,8 +13,7 @@ from PIL import Image
 import morphgen
 from morphgen.grammar.library import default_library
 from morphgen.model.robot import Robot
-from morphgen.splits.split import compose_member
-from morphgen.splits.split_file import read_split
+from morphgen.splits.split import compose_member, read_split
 
 REQUESTS = (
     "arm=ur5 ee=plane",

@@ -17,8 +17,7 @@ from morphgen.benchmark.figures import map_png
 from morphgen.encoding.similarity import MEASURES, features, similarity_matrix
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.grammar.library import default_library
-from morphgen.splits.split import Member, compose_member
-from morphgen.splits.split_file import read_split, split_names
+from morphgen.splits.split import Member, compose_member, read_split, split_names
 
 
 def main() -> int:

@@ -13,13 +13,11 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from morphgen import tasks as tasks
-    from morphgen.api.benchmark import similarity, tokens
     from morphgen.api.checks import check, conform, fix
     from morphgen.api.demonstrations import clone, demos, record, verify
-    from morphgen.api.environments import make_env
     from morphgen.api.evaluation import evaluate, play
     from morphgen.api.export import export
-    from morphgen.api.robots import compose, fit, read, sample, write
+    from morphgen.api.robots import compose, fit, make_env, read, sample, similarity, tokens, write
     from morphgen.api.splits import goals, split
     from morphgen.api.training import train
     from morphgen.errors import MorphgenError
@@ -67,14 +65,14 @@ _MODULES = {
     "fit": "morphgen.api.robots",
     "fix": "morphgen.api.checks",
     "goals": "morphgen.api.splits",
-    "make_env": "morphgen.api.environments",
+    "make_env": "morphgen.api.robots",
     "play": "morphgen.api.evaluation",
     "read": "morphgen.api.robots",
     "record": "morphgen.api.demonstrations",
     "sample": "morphgen.api.robots",
-    "similarity": "morphgen.api.benchmark",
+    "similarity": "morphgen.api.robots",
     "split": "morphgen.api.splits",
-    "tokens": "morphgen.api.benchmark",
+    "tokens": "morphgen.api.robots",
     "train": "morphgen.api.training",
     "verify": "morphgen.api.demonstrations",
     "write": "morphgen.api.robots",
@@ -94,8 +92,8 @@ if not TYPE_CHECKING:  # to type checkers, a name that is not imported above is 
             return getattr(_import_module(_MODULES[name]), name)
         except ModuleNotFoundError:
             # Said when the function is called, so that `import *` works without optional packages.
-            extras = _import_module("morphgen.extras")
-            return extras.explain_missing_extras("rl")(
+            errors = _import_module("morphgen.errors")
+            return errors.explain_missing_extras("rl")(
                 lambda *_, **__: _import_module(_MODULES[name])
             )
 

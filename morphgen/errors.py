@@ -1,11 +1,16 @@
-"""The errors that morphgen raises for users, and the hint that lists valid names."""
+"""Errors that morphgen raises for users, hints that list valid names, and checks of arguments."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from itertools import takewhile
+from numbers import Integral
 from operator import eq
+from os import PathLike
+from pathlib import Path
+from types import SimpleNamespace
 
 _MAX_LISTED = 24  # largest number of valid names that a hint lists completely
 _MAX_SHOWN = 8  # largest number of valid names that a hint shows of a longer list
@@ -124,3 +129,89 @@ def _likeness(name: str, choice: str) -> float:
     is_near = ratio >= 0.6 or (ratio >= 0.5 and num_unmatched < 3.5)
     num_equal = len(list(takewhile(bool, map(eq, name, choice))))  # letters at the beginning
     return ratio + 1e-4 * num_equal if is_near or is_part else 0.0  # which decide between equals
+
+
+EXTRAS = {
+    "coacd": ("convex",),
+    "embreex": ("fit",),
+    "fast_simplification": ("fit",),
+    "gymnasium": ("tasks", "rl"),
+    "imageio": ("tasks", "rl"),
+    "pyarrow": ("demos",),
+    "tensorboard": ("rl",),
+    "torch": ("tasks", "rl"),
+    "urdf_usd_converter": ("usd",),
+    "viser": ("viewer",),
+    "websockets": ("viewer",),
+}
+"""Optional packages by import name, and the extras of morphgen that install each, the smallest
+first."""
+
+
+def missing_extra(error: Exception, wanted: str = "") -> str | None:
+    """Return how to install the optional package that an import lacks; None for other errors."""
+    if not (isinstance(error, ModuleNotFoundError) and error.name in EXTRAS):
+        return None
+    extras = EXTRAS[error.name]
+    hint = f"pip install 'morphgen[{wanted if wanted in extras else extras[0]}]'"
+    if error.name == "torch":
+        hint += "; a small build without CUDA: https://pytorch.org/get-started/locally"
+    return f"the package {error.name} is not installed: {hint}"
+
+
+@contextmanager
+def explain_missing_extras(wanted: str = "") -> Iterator[None]:
+    """Convert the failed import of an optional package to an error with the wanted extra."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        text = missing_extra(error, wanted)
+        if text is None:
+            raise
+        raise MissingDependencyError(text) from error
+
+
+def path_argument(name: str, value: object, error: type[MorphgenError]) -> Path:
+    """Return the path that a text or another path names."""
+    if isinstance(value, str | PathLike):
+        path = Path(value)
+        if "\0" not in str(path):  # the system's calls raise ValueError, not OSError, for it
+            return path
+    raise error(f"{name} {value!r}: expected a path")
+
+
+def text_argument(name: str, value: object, error: type[MorphgenError]) -> str:
+    """Return a text."""
+    if isinstance(value, str):
+        return value
+    raise error(f"{name} {value!r}: expected a text")
+
+
+def whole_number(
+    name: str, value: object, error: type[MorphgenError], least: int | None = None
+) -> int:
+    """Return a whole number, such as one of NumPy's, as an ``int``."""
+    is_whole = isinstance(value, Integral) and not isinstance(value, bool)  # True is an Integral
+    if not is_whole or (least is not None and int(value) < least):  # type: ignore[call-overload]
+        valid = "a whole number" if least is None else f"a whole number, {least} or more"
+        raise error(f"{name} {value!r}: expected {valid}")
+    return int(value)  # type: ignore[call-overload,no-any-return]
+
+
+def require_types(
+    given: SimpleNamespace, error: type[MorphgenError], *texts: str, **least: int
+) -> None:
+    """Require texts by name, and others None or whole numbers of a least value, made ``int``."""
+    for name in (each for each in texts if getattr(given, each) is not None):
+        text_argument(name, getattr(given, name), error)
+    for name in (each for each in least if getattr(given, each) is not None):
+        setattr(given, name, whole_number(name, getattr(given, name), error, least[name]))
+
+
+def truth(name: str, value: object, error: type[MorphgenError]) -> bool:
+    """Return a ``bool``, also for one of NumPy's."""
+    import numpy as np  # 0.1 s, which `morphgen --help` does not need
+
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    raise error(f"{name} {value!r}: expected True or False")

@@ -20,8 +20,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
-from morphgen.arguments import whole_number
-from morphgen.errors import MissingDependencyError, MorphgenError
+from morphgen.errors import MissingDependencyError, MorphgenError, whole_number
 from morphgen.progress import STOP_SIGNALS, raise_if_interrupted, report, show_progress
 
 T = TypeVar("T")

@@ -18,8 +18,7 @@ import scipy  # loads its packages at their first use, which take seconds
 from msgspec import Meta
 from numpy.typing import ArrayLike, NDArray
 
-from morphgen.arguments import path_argument
-from morphgen.errors import BenchmarkError, TaskError, nearest
+from morphgen.errors import BenchmarkError, TaskError, nearest, path_argument
 from morphgen.formats.files import require_writable_file, write_file
 from morphgen.formats.records import FiniteNumber, Record
 from morphgen.splits.split import Side

@@ -13,7 +13,7 @@ import pytest
 
 import morphgen
 from helpers.commands import WITHOUT_PROGRESS
-from morphgen.extras import EXTRAS
+from morphgen.errors import EXTRAS
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = Path(morphgen.__file__).parent
@@ -23,9 +23,9 @@ FOLDERS = [
 ]
 """Folders of modules; a source distribution has ``tasks`` only as ``morphgen/tasks``."""
 PACKAGES = (
-    *("errors", "arguments", "extras", "typing", "files", "progress", "processes", "tables"),
+    *("errors", "typing", "files", "progress", "processes", "tables"),
     *("model", "formats", "checks", "grammar", "fitting", "encoding", "splits"),
-    *("tasks", "rl", "benchmark", "viewer", "api", "doctor", "cli"),
+    *("tasks", "rl", "benchmark", "viewer", "api", "cli"),
 )
 """Packages and modules of morphgen, the lowest first; each may import itself and those below."""
 MODULES = sorted(

@@ -41,8 +41,16 @@ from morphgen.grammar.request import default_name, parse_words
 from morphgen.grammar.robot_source import RobotReference, light_derivation, read_source
 from morphgen.grammar.syntax import Derivation, parse_derivation
 from morphgen.model.robot import Robot
-from morphgen.splits.split import SIDES, Member, Side, Split, compose_member
-from morphgen.splits.split_file import find_split, read_split_file, split_names
+from morphgen.splits.split import (
+    SIDES,
+    Member,
+    Side,
+    Split,
+    compose_member,
+    find_split,
+    read_split_file,
+    split_names,
+)
 
 WORDS, DERIVATION, MEMBER, UPLOAD = "words:", "derivation:", "split:", "upload:"
 """Schemes of robot URIs; a URI without scheme is a path."""

@@ -16,10 +16,9 @@ from morphgen.api.training import (
     train_run,
     with_goal,
 )
-from morphgen.arguments import path_argument, require_types, whole_number
 from morphgen.benchmark.demonstrations import Verification, changed_files, describe
 from morphgen.encoding.tokens import default_max_links
-from morphgen.errors import MorphgenError, TaskError
+from morphgen.errors import MorphgenError, TaskError, path_argument, require_types, whole_number
 from morphgen.grammar.library import LibraryFolders, library_folders
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import AgentSpec, parse_agent

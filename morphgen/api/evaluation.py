@@ -13,7 +13,6 @@ from types import SimpleNamespace
 from typing import Any
 
 from morphgen.api.training import named_source, with_goal
-from morphgen.arguments import path_argument, require_types, text_argument
 from morphgen.benchmark.release import is_release, read_release
 from morphgen.benchmark.scores.submission import (
     EvalProtocol,
@@ -23,7 +22,7 @@ from morphgen.benchmark.scores.submission import (
     require_rules,
     submission_text,
 )
-from morphgen.errors import TaskError, nearest
+from morphgen.errors import TaskError, nearest, path_argument, require_types, text_argument
 from morphgen.formats.files import require_writable_file, write_file
 from morphgen.grammar.library import LibraryFolders, library_folders
 from morphgen.grammar.robot_source import RobotLike

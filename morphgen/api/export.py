@@ -14,14 +14,19 @@ from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 
 from morphgen.api.checks import bundle_of
-from morphgen.arguments import path_argument, require_types, text_argument
 from morphgen.checks.srdf import (
     MATRIX_SAMPLES,
     require_tool,
     robot_srdf_text,
 )
-from morphgen.errors import FormatError, nearest
-from morphgen.extras import explain_missing_extras
+from morphgen.errors import (
+    FormatError,
+    explain_missing_extras,
+    nearest,
+    path_argument,
+    require_types,
+    text_argument,
+)
 from morphgen.files import write_atomic
 from morphgen.fitting.replace_collision import as_spheres, link_spheres
 from morphgen.formats.bundle import (

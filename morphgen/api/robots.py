@@ -1,31 +1,51 @@
-"""Compose, sample, read and write robots."""
+"""Compose, sample, read, write, fit, encode and compare robots; make environments of them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from numbers import Real
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, overload
 
-from morphgen.arguments import path_argument, text_argument, truth, whole_number
+import numpy as np
+from numpy.typing import ArrayLike
+
 from morphgen.checks import check
-from morphgen.errors import CompositionError, FormatError, GrammarError, nearest
-from morphgen.extras import explain_missing_extras
+from morphgen.encoding import tokens as encoding
+from morphgen.encoding.similarity import MEASURES, features, get_measure, similarity_matrix
+from morphgen.encoding.tokens import default_max_links
+from morphgen.errors import (
+    BenchmarkError,
+    CompositionError,
+    FormatError,
+    GrammarError,
+    TaskError,
+    explain_missing_extras,
+    nearest,
+    path_argument,
+    text_argument,
+    truth,
+    whole_number,
+)
 from morphgen.fitting.replace_collision import GEOMETRIES, with_geometry
+from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.bundle import bundle_folder, read_robot, write_bundle
 from morphgen.grammar.analysis import load_sound_grammar
 from morphgen.grammar.compose import compose as compose_derivation
 from morphgen.grammar.library import LibraryFolders, default_library
 from morphgen.grammar.request import parse_words
-from morphgen.grammar.robot_source import RobotLike, resolve_robot
+from morphgen.grammar.robot_source import RobotLike, is_one_robot, resolve_robot, robot_list
 from morphgen.grammar.sampling import SamplingError, sample_robots
 from morphgen.grammar.values import parse_conditions
 from morphgen.model.geometry import MESH_SUFFIXES, Mesh, Shape
 from morphgen.model.robot import Link, Robot
+from morphgen.typing import Array
 
 if TYPE_CHECKING:
     from morphgen.fitting.replace_collision import FittedRobot
+    from morphgen.tasks.gym.env import TaskEnv
+    from morphgen.tasks.gym.vector import TaskVector
 
 
 @explain_missing_extras()
@@ -232,3 +252,169 @@ def fit(
         robot = Robot(path.stem, (Link(path.stem, collisions=(Shape(Mesh(path)),)),), ())
     target = resolve_robot(robot, parts)
     return fit_robot(target, options, parts.folders, jobs=jobs)
+
+
+@overload
+def make_env(
+    task: str, robot: RobotLike = ..., *, num_envs: None = None, **options: object
+) -> TaskEnv: ...
+@overload
+def make_env(
+    task: str,
+    robot: RobotLike | Sequence[RobotLike] = ...,
+    *,
+    num_envs: int,
+    **options: object,
+) -> TaskVector: ...
+@explain_missing_extras()
+def make_env(
+    task: str,
+    robot: RobotLike | Sequence[RobotLike] = "ur5-plane",
+    *,
+    num_envs: int | None = None,
+    **options: Any,
+) -> TaskEnv | TaskVector:
+    """Make a Gymnasium environment of a robot at a task, or a vector environment of several.
+
+    Examples:
+        >>> env = morphgen.make_env("reach", "arm=ur5 ee=plane")
+        >>> observation, info = env.reset(seed=0)
+        >>> action = env.action_space.sample()
+        >>> observation, reward, terminated, truncated, info = env.step(action)
+        >>> terminated, truncated
+        (False, False)
+        >>> env.close()
+        >>> envs = morphgen.make_env("reach", ["ur5-plane", "arm3-stick"], num_envs=4)
+        >>> envs.reset(seed=0)[0]["tokens"].shape
+        (4, 10, 48)
+        >>> envs.close()
+
+    Args:
+        task: Name of a task, such as ``reach`` or ``push``.
+        robot: A robot, or its name: words of ``compose``, parts joined by dashes, a bundle's folder
+            or a URDF. For vector environments it may be a list: environment i has robot i modulo
+            their number.
+        num_envs: None for one environment without a batch axis, ``TaskEnv``; a number, also 1, for
+            that many in a vector environment, ``TaskVector``.
+        **options: The simulator (``sim="pybullet"``), ``obstacles=True``, ``kind="discrete"``,
+            ``library`` and others: for one environment those of ``TaskEnv``, such as
+            ``render_mode="rgb_array"``; for vector environments those of ``make_batch``, such as
+            ``workers=2``.
+
+    Raises:
+        TaskError: If an argument is unknown or invalid.
+        MissingDependencyError: If the extra ``tasks`` or the simulator is not installed.
+        MorphgenError: If a robot cannot be composed or read, or cannot do the task.
+    """
+    texts: dict[str, object] = {"task": task, **options}
+    for name in ("task", "sim", "kind"):
+        if name in texts and (name, texts[name]) != ("sim", None):
+            text_argument(name, texts[name], TaskError)
+    if num_envs is None:
+        from morphgen.tasks.gym.env import TaskEnv
+
+        if not is_one_robot(robot):
+            raise TaskError(f"robot {robot!r}: expected one robot; name several with num_envs")
+        return TaskEnv(task, robot, **options)
+    from morphgen.tasks.gym.vector import task_vector
+
+    several = robot_list(robot)
+    if not several:
+        raise TaskError("robot []: expected at least one robot")
+    return task_vector(num_envs, task=task, robots=several, **options)
+
+
+@explain_missing_extras()
+def tokens(
+    robot: RobotLike,
+    q: ArrayLike | None = None,
+    *,
+    max_links: int | None = None,
+    library: LibraryFolders = (),
+) -> Array:
+    """Encode a robot as 48 numbers per link, the input of the paper's policies.
+
+    Examples:
+        >>> robot = morphgen.compose("ur5-plane")
+        >>> morphgen.tokens(robot).shape == (len(robot.links), 48)
+        True
+
+    Args:
+        robot: The robot, its bundle's folder, a description, or words of ``compose``.
+        q: Independent joint positions, shape (..., dof) [rad or m]; by default the home.
+        max_links: Number that link indices are relative to, the same for all robots that are
+            compared; by default the paper's 23, or the links of the robot if it has more.
+        library: Folders of your own parts.
+
+    Returns:
+        Tokens of the links, root first, shape (..., n_links, 48);
+        ``morphgen.encoding.tokens.LAYOUT`` describes their fields.
+
+    Raises:
+        BenchmarkError: If the robot has more links than ``max_links`` or cannot be encoded.
+        MissingDependencyError: If a mesh has to be fitted and the extra ``fit`` is missing.
+        MorphgenError: If the robot cannot be composed or read.
+        ValueError: If the last axis of ``q`` is not ``robot.dof`` long.
+    """
+    parts = default_library(library)
+    loaded = resolve_robot(robot, parts)
+    size = default_max_links([len(loaded.links)]) if max_links is None else max_links
+    if q is not None:
+        try:
+            q = np.asarray(q, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise BenchmarkError(f"q {q!r}: expected joint positions") from None
+    return encoding.tokens(loaded, token_shapes(loaded, parts.folders), q, max_links=size)
+
+
+@explain_missing_extras()
+def similarity(
+    robots: Iterable[RobotLike],
+    measures: Sequence[str] = tuple(MEASURES),
+    *,
+    max_links: int | None = None,
+    library: LibraryFolders = (),
+) -> dict[str, Array]:
+    """Compare all pairs of robots by their tokens, kinematic trees and workspaces.
+
+    Examples:
+        >>> values = morphgen.similarity(["ur5-plane", "ur10-plane", "arm3-stick"])
+        >>> list(values)
+        ['cosine', 'tree', 'workspace']
+        >>> bool(values["tree"][0, 1] < values["tree"][0, 2])
+        True
+
+    Args:
+        robots: Two or more robots, each given itself or named as for ``tokens``.
+        measures: Names of measures: ``cosine`` of the tokens, ``tree``, the edit distance of the
+            kinematic trees, and ``workspace``, the overlap of the tool positions.
+        max_links: See ``tokens``; by default at least the links of the largest robot.
+        library: Folders of your own parts.
+
+    Returns:
+        A symmetric matrix by measure, shape (n, n), in the order of the robots. 1 means equal for
+        ``cosine`` and ``workspace``, 0 for the distance ``tree``.
+
+    Raises:
+        BenchmarkError: If a measure is unknown, there are fewer than two robots, or a robot has
+            no movable tool.
+        MissingDependencyError: If a mesh has to be fitted and the extra ``fit`` is missing.
+        MorphgenError: If a robot cannot be composed or read.
+    """
+    several = (
+        [measures] if isinstance(measures, str) or not isinstance(measures, Iterable) else measures
+    )
+    names = [text_argument("measure", name, BenchmarkError) for name in several]
+    if not names:
+        raise BenchmarkError(f"no measure is named; valid: {', '.join(MEASURES)}")
+    for name in names:  # before robots are read and fitted
+        get_measure(name)
+    parts = default_library(library)
+    loaded = [resolve_robot(robot, parts) for robot in robot_list(robots)]
+    if len(loaded) < 2:
+        raise BenchmarkError(f"{len(loaded)} robots to compare; expected a list of two or more")
+    size = default_max_links(len(each.links) for each in loaded) if max_links is None else max_links
+    compared = [
+        features(each, token_shapes(each, parts.folders), max_links=size) for each in loaded
+    ]
+    return {name: similarity_matrix(compared, name) for name in names}

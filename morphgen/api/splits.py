@@ -11,8 +11,6 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, overload
 
-from morphgen.arguments import path_argument, text_argument, truth, whole_number
-from morphgen.benchmark.audit import Audit, audit
 from morphgen.benchmark.generate import (
     SplitRequest,
     composition,
@@ -27,16 +25,27 @@ from morphgen.benchmark.split_folder import (
     compare_robots,
     read_split_or_folder,
 )
-from morphgen.benchmark.survey import statistics
+from morphgen.benchmark.survey import Audit, audit, statistics
 from morphgen.encoding.tokens import MAX_LINKS
-from morphgen.errors import BenchmarkError, nearest
-from morphgen.extras import explain_missing_extras
+from morphgen.errors import (
+    BenchmarkError,
+    explain_missing_extras,
+    nearest,
+    path_argument,
+    text_argument,
+    truth,
+    whole_number,
+)
 from morphgen.grammar.analysis import load_sound_grammar
 from morphgen.grammar.library import Library, LibraryFolders, default_library
 from morphgen.model.robot import Robot
 from morphgen.progress import part_of
-from morphgen.splits.split import HOLD_OUT, REGIMES, Regime, Split, compose_side
-from morphgen.splits.split_file import (
+from morphgen.splits.split import (
+    HOLD_OUT,
+    REGIMES,
+    Regime,
+    Split,
+    compose_side,
     require_split_name,
     split_names,
     split_paths,
@@ -121,7 +130,7 @@ class LoadedSplit:
 
     @explain_missing_extras()
     def audit(self, *, jobs: int = 1) -> Audit:
-        """Find leaks between train and test robots; see ``morphgen.benchmark.audit.audit``.
+        """Find leaks between train and test robots; see ``morphgen.benchmark.survey.audit``.
 
         Args:
             jobs: Number of processes.

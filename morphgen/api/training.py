@@ -11,10 +11,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from morphgen.arguments import require_types
 from morphgen.benchmark.split_folder import read_split_or_folder
 from morphgen.encoding.tokens import default_max_links, require_max_links
-from morphgen.errors import BenchmarkError, TaskError
+from morphgen.errors import BenchmarkError, TaskError, require_types
 from morphgen.formats.description import SUFFIXES
 from morphgen.grammar.library import LibraryFolders, library_folders
 from morphgen.grammar.robot_source import is_robot_folder, is_set_folder
@@ -36,8 +35,7 @@ from morphgen.rl.runs.training import (
 )
 from morphgen.rl.runs.training import train as train_parts
 from morphgen.rl.shipped_policies import checkpoint_path
-from morphgen.splits.split import Side, require_side
-from morphgen.splits.split_file import read_split
+from morphgen.splits.split import Side, read_split, require_side
 from morphgen.tasks.configs import ReachConfig
 from morphgen.tasks.goals.split_goals import has_goals, read_split_goals
 from morphgen.tasks.registry import (

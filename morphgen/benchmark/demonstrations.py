@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from morphgen.benchmark import licences
+from morphgen.benchmark import licences, read_text
 from morphgen.benchmark.split_folder import README_FILE, SUMS_FILE, read_sums, sums_text
-from morphgen.benchmark.texts import read_text
 from morphgen.files import write_atomic
 from morphgen.formats.bundle import CARD
 from morphgen.formats.data_files import read_json

@@ -22,14 +22,18 @@ from morphgen.grammar.library import Library
 from morphgen.grammar.syntax import Derivation
 from morphgen.processes import parallel_map
 from morphgen.progress import report, show_progress
-from morphgen.splits.candidates import (
+from morphgen.splits.split import (
+    COMPOSED,
+    MAX_LINKS_KEY,
     Candidate,
     DerivedRecipe,
+    Member,
+    Regime,
     RobotFactory,
     SampledRecipe,
+    Split,
     numbered_name,
 )
-from morphgen.splits.split import COMPOSED, MAX_LINKS_KEY, Member, Regime, Split
 
 
 def stream_seed(seed: int, prefix: str) -> int:

@@ -35,14 +35,16 @@ from morphgen.grammar.syntax import Derivation, parse_derivation
 from morphgen.model.findings import Finding
 from morphgen.processes import parallel_map
 from morphgen.progress import part_of, report, stage
-from morphgen.splits.candidates import (
+from morphgen.splits.split import (
+    HOLD_OUT,
+    HOLD_OUT_KEY,
     Candidate,
     DerivedRecipe,
     RobotFactory,
     SampledRecipe,
+    Split,
     UnfitRobotError,
 )
-from morphgen.splits.split import HOLD_OUT, HOLD_OUT_KEY, Split
 
 MANUFACTURER = "manufacturer"  # key of conditions on the manufacturer of a part
 EXAMPLES = "arm=kinova*, manufacturer=Kinova or arm=ur5+ee=plane"

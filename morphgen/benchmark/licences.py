@@ -15,8 +15,8 @@ from typing import Any
 
 import yaml
 
+from morphgen.benchmark import read_text
 from morphgen.benchmark.regimes import parts as part_names
-from morphgen.benchmark.texts import read_text
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.library import Library
 from morphgen.grammar.syntax import parse_derivation

@@ -24,8 +24,15 @@ from morphgen.grammar.manifest import MOUNT_YAW
 from morphgen.grammar.request import SLOTS
 from morphgen.grammar.syntax import Derivation, parse_derivation
 from morphgen.model.findings import Finding, texts_of
-from morphgen.splits.candidates import Candidate, DerivedRecipe, recipe_of
-from morphgen.splits.split import COMPOSED, Member, Regime, Split
+from morphgen.splits.split import (
+    COMPOSED,
+    Candidate,
+    DerivedRecipe,
+    Member,
+    Regime,
+    Split,
+    recipe_of,
+)
 
 NOTHING = "none"  # name of the part for robots without an end-effector
 _CHOICE = re.compile(r"\{([^{}]*)\}")

@@ -30,8 +30,7 @@ from typing import Any
 
 import msgspec
 
-from morphgen.benchmark import licences
-from morphgen.benchmark.audit import audit
+from morphgen.benchmark import licences, read_text
 from morphgen.benchmark.scores.submission import EvalProtocol, tasks_of_split
 from morphgen.benchmark.split_folder import (
     README_FILE,
@@ -50,7 +49,7 @@ from morphgen.benchmark.split_folder import (
     sums_text,
     writing_split,
 )
-from morphgen.benchmark.texts import read_text
+from morphgen.benchmark.survey import audit
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.files import file_sha256, write_atomic
 from morphgen.formats.data_files import read_json
@@ -60,8 +59,16 @@ from morphgen.formats.zip_files import ZipLimits, unpack_zip, write_zip
 from morphgen.grammar.library import Library
 from morphgen.processes import parallel_map
 from morphgen.progress import stage
-from morphgen.splits.split import Member, Side, Split, sided_members, split_id
-from morphgen.splits.split_file import find_split, is_split_name, read_split_file
+from morphgen.splits.split import (
+    Member,
+    Side,
+    Split,
+    find_split,
+    is_split_name,
+    read_split_file,
+    sided_members,
+    split_id,
+)
 from morphgen.tasks.goals.split_goals import (
     GOALS,
     GoalResult,

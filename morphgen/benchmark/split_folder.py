@@ -31,8 +31,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from morphgen.benchmark import read_text as package_text
 from morphgen.benchmark.survey import SurveyedRobot, measure_robot
-from morphgen.benchmark.texts import read_text as package_text
 from morphgen.checks import check
 from morphgen.encoding import tokens as encoding
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError
@@ -45,8 +45,16 @@ from morphgen.formats.zip_files import read_npz
 from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map
-from morphgen.splits.split import SIDES, Member, Split, compose_member, sided_members, split_id
-from morphgen.splits.split_file import read_split, split_text
+from morphgen.splits.split import (
+    SIDES,
+    Member,
+    Split,
+    compose_member,
+    read_split,
+    sided_members,
+    split_id,
+    split_text,
+)
 from morphgen.typing import Array
 
 SPLIT_FILE = "split.yaml"

@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from morphgen.arguments import whole_number
 from morphgen.checks.readers import (
     LOADERS,
     NO_LIMITS,
@@ -30,7 +29,7 @@ from morphgen.checks.readers import (
     load_model,
     loader_copy,
 )
-from morphgen.errors import FormatError, MorphgenError, one_line
+from morphgen.errors import FormatError, MorphgenError, one_line, whole_number
 from morphgen.formats.bundle import MJCF, URDF, read_bundle
 from morphgen.formats.description import read_description
 from morphgen.formats.quiet import MujocoWarnings, quiet

@@ -62,8 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None, received: list[int]) -> int:
     """Run a command; the signals that stop it are appended to ``received``."""
     from morphgen.cli.command import UsageError, parse
-    from morphgen.errors import MorphgenError, one_line
-    from morphgen.extras import missing_extra
+    from morphgen.errors import MorphgenError, missing_extra, one_line
 
     parser = build_parser(sys.argv[1:] if argv is None else argv)
     try:

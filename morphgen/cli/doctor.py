@@ -3,15 +3,262 @@
 from __future__ import annotations
 
 import argparse
+import importlib.metadata
 import json
+import os
+import platform
 import shlex
+import sys
 import time
 from collections import Counter
-from dataclasses import asdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from packaging.requirements import Requirement
+from platformdirs import user_cache_path
 
 from morphgen.cli import build_parser
 from morphgen.cli.command import parse
-from morphgen.doctor import Entry, diagnose
+from morphgen.errors import (
+    MissingDependencyError,
+    MorphgenError,
+    PartError,
+    missing_extra,
+    one_line,
+)
+from morphgen.formats.resolve import REQUIREMENTS, distribution_file
+from morphgen.processes import usable_cores
+
+NOT_FOR_USERS = frozenset(("all", "bench", "dev", "docs", "test"))
+"""Extras that the diagnosis leaves out: a sum of others, and those for work on morphgen itself."""
+Status = Literal["ok", "absent", "warning", "error"]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One result."""
+
+    name: str  # name of what was examined, such as `library`
+    status: Status
+    """``absent`` for an optional package, ``error`` if morphgen does not work as documented."""
+    text: str  # result, and what to do about it if it is not `ok`; one line
+    data: Mapping[str, object] = field(default_factory=dict)  # values of the text, for programs
+
+
+def diagnose() -> Iterator[tuple[str, Entry]]:
+    """Examine the installation; yield each result with its section as soon as it is known.
+
+    An error of a broken package is a result, too.
+    """
+    for name, examine in (
+        ("morphgen", _morphgen),
+        ("python", _python),
+        ("cpu", _cpu),
+        ("gpu", _gpu),
+        ("cache", _cache),
+    ):
+        yield "system", attempt(name, examine)
+    for entry in packages():
+        yield "packages", entry
+    yield "files", attempt("library", _library)
+    for package in REQUIREMENTS:
+        yield "files", attempt(f"robots of {package}", partial(_robot_package, package))
+
+
+def attempt(name: str, examine: Callable[[], Entry]) -> Entry:
+    """Return the result of a function; whatever it raises, the result says why."""
+    try:
+        return examine()
+    except Exception as error:
+        cause: BaseException | None = error
+        while cause is not None:
+            if isinstance(cause, KeyboardInterrupt):
+                raise cause from None
+            cause = cause.__cause__ or cause.__context__
+        text = missing_extra(error)
+        if text is not None:
+            return Entry(name, "absent", text)
+        if isinstance(error, ModuleNotFoundError):
+            text = f"the package {error.name} is not installed; install morphgen again"
+        elif isinstance(error, MorphgenError):
+            text = str(error)
+        else:
+            text = f"{type(error).__name__}: {error}"
+        status: Status = "absent" if isinstance(error, MissingDependencyError) else "error"
+        return Entry(name, status, one_line(text))
+
+
+def _morphgen() -> Entry:
+    folder = str(Path(__file__).parent)
+    number = importlib.metadata.version("morphgen")
+    return Entry("morphgen", "ok", f"{number} in {folder}", {"version": number, "folder": folder})
+
+
+def _python() -> Entry:
+    data = {"version": platform.python_version(), "platform": platform.platform()}
+    text = f"{platform.python_implementation()} {data['version']} at {sys.executable}"
+    return Entry("python", "ok", f"{text}, {data['platform']}", data)
+
+
+def _cpu() -> Entry:
+    total = os.cpu_count() or 1
+    usable = usable_cores()
+    text = f"{platform.machine()}, {usable} of {total} logical cores may be used"
+    return Entry("cpu", "ok", text, {"machine": platform.machine(), "cores": usable})
+
+
+def _gpu() -> Entry:
+    """Describe the GPUs that torch can compute on."""
+    import torch
+
+    if not torch.cuda.is_available():
+        build = torch.version.cuda
+        why = "torch was built without CUDA" if build is None else f"no device for CUDA {build}"
+        return Entry("gpu", "ok", f"none ({why}); everything runs on the CPU", {"devices": []})
+    names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    # A device that is listed may lack kernels for its architecture.
+    torch.ones(2, device="cuda").sum().item()
+    text = f"{', '.join(names)} with CUDA {torch.version.cuda}; --device cuda works"
+    return Entry("gpu", "ok", text, {"devices": names, "cuda": torch.version.cuda})
+
+
+def _cache() -> Entry:
+    """Describe the folder of goal sets, fits and thumbnails that need not be made again."""
+    folder = user_cache_path("morphgen")
+    # The cache is created at its first use.
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    sizes = {
+        entry.name: sum(path.stat().st_size for path in entry.rglob("*") if path.is_file())
+        for entry in sorted(folder.iterdir() if folder.is_dir() else ())
+        if entry.is_dir()
+    }
+    data = {"folder": str(folder), "bytes": sizes}
+    if not os.access(existing, os.W_OK):
+        text = f"{folder} cannot be written: goal sets and fits are made anew each time"
+        return Entry("cache", "warning", text, data)
+    listed = ", ".join(f"{name} {size / 1e6:.1f} MB" for name, size in sizes.items())
+    return Entry("cache", "ok", f"{folder}: {listed or 'empty'}; delete it to clear it", data)
+
+
+def packages() -> Iterator[Entry]:
+    """Compare the installed packages with the ranges that morphgen declares."""
+    distribution = importlib.metadata.distribution("morphgen")
+    declared = [Requirement(line) for line in distribution.requires or ()]
+    yield from _group("core", _requirements("", declared))
+    for extra in distribution.metadata.get_all("Provides-Extra") or ():
+        if extra not in NOT_FOR_USERS:
+            yield from _group(f"extra {extra}", _requirements(extra, declared))
+
+
+def _requirements(extra: str, declared: Sequence[Requirement]) -> list[Requirement]:
+    """Return the requirements of an extra, and of the extras that it includes."""
+    chosen: dict[str, Requirement] = {}
+    for requirement in declared:
+        marker = requirement.marker
+        if (marker is None) == bool(extra) or (marker and not marker.evaluate({"extra": extra})):
+            continue
+        if requirement.name == "morphgen":
+            for included in sorted(requirement.extras):
+                chosen |= {each.name: each for each in _requirements(included, declared)}
+        else:
+            chosen[requirement.name] = requirement
+    return list(chosen.values())
+
+
+def _group(name: str, requirements: Sequence[Requirement]) -> Iterator[Entry]:
+    """Yield a result for the core or an extra, and one for each package outside its range."""
+    versions = {each.name: _version(each.name) for each in requirements}
+    missing = [package for package, number in versions.items() if number is None]
+    for requirement in requirements:
+        number = versions[requirement.name]
+        if number and not requirement.specifier.contains(number, prereleases=True):
+            text = f"{number} is outside of the range {requirement.specifier} that morphgen needs"
+            yield Entry(f"package {requirement.name}", "warning", text)
+    kind, _, extra = name.partition(" ")
+    if not requirements:
+        yield Entry(name, "absent", "not available for this version of Python")
+    elif missing and kind == "core":
+        text = f"not installed: {', '.join(missing)}; install morphgen again"
+        yield Entry(name, "error", text, versions)
+    elif missing:
+        text = f"not installed: {', '.join(missing)}; pip install 'morphgen[{extra}]'"
+        yield Entry(name, "absent", text, versions)
+    else:
+        text = ", ".join(f"{package} {number}" for package, number in sorted(versions.items()))
+        yield Entry(name, "ok", text, versions)
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _library() -> Entry:
+    """Count the parts, and name the folders of the user's own."""
+    # Here and below, because packages that these modules import may be broken.
+    from morphgen.grammar import library as parts
+    from morphgen.grammar.manifest import PART_KINDS
+
+    library = parts.default_library()
+    try:
+        library.paths  # noqa: B018 - which reads the folders
+    except PartError as error:
+        variable = f"{parts.LIBRARY_VARIABLE}={os.environ.get(parts.LIBRARY_VARIABLE, '')}"
+        return Entry("library", "error", f"{error}; change {variable}")
+    kinds = Counter(manifest.kind for manifest in library.manifests())
+    counts = {kind: kinds[kind] for kind in PART_KINDS}
+    listed = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    text = f"{sum(counts.values())} parts: {listed}"
+    for folder in library.folders[len(parts.shipped_folders()) :]:
+        text += (
+            f"; {len(parts.Library([folder]).paths)} of them in {folder} ({parts.LIBRARY_VARIABLE})"
+        )
+    data = {"parts": counts, "folders": [str(folder) for folder in library.folders]}
+    if faults := library.faults():
+        text += f"; left out: {'; '.join(map(str, faults))}"
+    return Entry("library", "warning" if faults else "ok", one_line(text), data)
+
+
+def _robot_package(package: str) -> Entry:
+    """Find the files of all parts from a data package, and compare them with the tested ones."""
+    from morphgen.grammar.catalogue import source_digest, stored_facts
+    from morphgen.grammar.library import Library, shipped_folders
+    from morphgen.grammar.manifest import PackageSource
+
+    name = f"robots of {package}"
+    parts = [
+        (manifest, manifest.source.file)
+        for manifest in Library(shipped_folders()).manifests()
+        if isinstance(manifest.source, PackageSource) and manifest.source.package == package
+    ]
+    errors = []
+    for _, file in parts:
+        try:
+            distribution_file(package, file)
+        except MorphgenError as error:
+            errors.append(str(error))
+    if errors:
+        text = f"{len(errors)} of {len(parts)} parts lack their file: {errors[0]}"
+        return Entry(name, "error", text, {"errors": errors})
+    stored, number = stored_facts(), importlib.metadata.version(package)
+    changed = [
+        manifest.name
+        for manifest, _ in parts
+        if stored.get(manifest.name, {}).get("digest") != source_digest(manifest)
+    ]
+    data = {"version": number, "parts": len(parts), "changed": changed}
+    if changed:
+        text = (
+            f"{len(changed)} of {len(parts)} parts are not those that this morphgen was tested "
+            f"with: {package} {number} is another version, or their YAML files were changed"
+        )
+        return Entry(name, "warning", text, data)
+    return Entry(name, "ok", f"{number}, with the files of {len(parts)} parts", data)
 
 
 def demo(args: argparse.Namespace) -> int:

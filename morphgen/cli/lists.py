@@ -50,7 +50,7 @@ SHORT_DERIVATION = 60  # number of characters of a derivation that `show` prints
 
 def list_splits(args: argparse.Namespace) -> None:
     """Print a row per split."""
-    from morphgen.splits.split_file import read_split, split_names
+    from morphgen.splits.split import read_split, split_names
 
     splits = [read_split(name) for name in split_names()]
     data: list[dict[str, Any]] = [
@@ -82,8 +82,7 @@ def list_splits(args: argparse.Namespace) -> None:
 def show_split(args: argparse.Namespace) -> None:
     """Print a split."""
     from morphgen.benchmark.licences import licence_lines, licenced_parts
-    from morphgen.splits.split import split_id
-    from morphgen.splits.split_file import read_split
+    from morphgen.splits.split import read_split, split_id
 
     split = read_split(args.split)
     try:

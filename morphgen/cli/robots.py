@@ -69,7 +69,7 @@ def show(args: argparse.Namespace) -> None:
     """Print the link tree of one robot, or what a data set of demonstrations has."""
     if len(args.words) == 1 and (Path(args.words[0]) / RECORDING).is_file():
         from morphgen.api.demonstrations import demos
-        from morphgen.cli.demonstrations import print_summary
+        from morphgen.cli.evaluate import print_summary
 
         print_summary(args, demos(args.words[0]))
         return

@@ -16,7 +16,6 @@ from morphgen.api.splits import goals as sample_goals
 from morphgen.api.splits import split as open_split
 from morphgen.benchmark import release as releases
 from morphgen.benchmark import split_folder, survey
-from morphgen.benchmark.audit import Audit
 from morphgen.benchmark.scores import results as scores
 from morphgen.benchmark.scores.submission import (
     DEFAULT_EPISODES,
@@ -30,15 +29,24 @@ from morphgen.benchmark.scores.submission import (
     require_same_random,
     tasks_of_split,
 )
-from morphgen.benchmark.survey import paper_row, statistics
+from morphgen.benchmark.survey import Audit, paper_row, statistics
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, status
 from morphgen.encoding.similarity import MEASURES
 from morphgen.errors import BenchmarkError
 from morphgen.formats.files import require_writable_folder
 from morphgen.model.findings import Finding
-from morphgen.splits.split import HOLD_OUT, REGIMES, SIDES, Split, split_id
-from morphgen.splits.split_file import read_split, split_names, split_paths, write_new_splits
+from morphgen.splits.split import (
+    HOLD_OUT,
+    REGIMES,
+    SIDES,
+    Split,
+    read_split,
+    split_id,
+    split_names,
+    split_paths,
+    write_new_splits,
+)
 from morphgen.tables import table
 from morphgen.tasks.goals.split_goals import GoalResult, sample_split_goals
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, TASKS
@@ -398,7 +406,7 @@ def _replays(
 ) -> list[tuple[str, bool]]:
     """Run episodes of submissions again; return a line for each, and whether it agrees."""
     # Other commands of splits need no torch.
-    from morphgen.benchmark.scores.replay import needs_checkpoint, replay_submission
+    from morphgen.benchmark.scores.study import needs_checkpoint, replay_submission
 
     named = list(zip(args.submissions, submissions, strict=True))
     unnamed = [path for path, each in named if needs_checkpoint(each)]

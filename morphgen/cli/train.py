@@ -36,7 +36,7 @@ from morphgen.rl.runs.training import (
     subruns_of,
 )
 from morphgen.rl.shipped_policies import POLICIES
-from morphgen.splits.split_file import read_split, split_names
+from morphgen.splits.split import read_split, split_names
 from morphgen.tasks.registry import (
     DEFAULT_SIMULATOR,
     SIMULATORS,

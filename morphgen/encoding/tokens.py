@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from morphgen.arguments import whole_number
-from morphgen.errors import BenchmarkError, nearest
+from morphgen.errors import BenchmarkError, nearest, whole_number
 from morphgen.formats.rounding import as_written
 from morphgen.model import rotation
 from morphgen.model.geometry import IDENTITY, Box, Capsule, Cylinder, Geometry, Pose, Shape, Sphere

@@ -10,8 +10,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TypeAlias
 
-from morphgen.arguments import path_argument
-from morphgen.errors import PartError, nearest, one_line
+from morphgen.errors import PartError, nearest, one_line, path_argument
 from morphgen.files import cached_until_changed
 from morphgen.grammar.manifest import PART_KINDS, Manifest, PartKind, read_manifest
 from morphgen.progress import note

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morphgen.errors import TaskError
-from morphgen.extras import explain_missing_extras
+from morphgen.errors import TaskError, explain_missing_extras
 from morphgen.files import replacing_file, write_cache_file
 from morphgen.formats.data_files import parse_json, read_json, read_text
 from morphgen.formats.zip_files import read_npz

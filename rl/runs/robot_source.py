@@ -34,12 +34,18 @@ from morphgen.model.robot import TOOL, Robot
 from morphgen.processes import parallel_stream
 from morphgen.progress import own_progress, show_progress
 from morphgen.rl.config import read_fields
-from morphgen.splits.candidates import RobotFactory, SampledRecipe, numbered_name
-from morphgen.splits.split import Member, Side, Split, compose_member, split_id
-from morphgen.splits.split_file import (
+from morphgen.splits.split import (
+    Member,
     MemberRecord,
+    RobotFactory,
+    SampledRecipe,
+    Side,
+    Split,
+    compose_member,
+    numbered_name,
     parse_split,
     read_split,
+    split_id,
     split_names,
     split_text,
 )

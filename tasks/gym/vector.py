@@ -16,8 +16,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from morphgen.arguments import whole_number
-from morphgen.errors import TaskError, nearest
+from morphgen.errors import TaskError, nearest, whole_number
 from morphgen.grammar.robot_source import RobotLike
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step, TaskBatch

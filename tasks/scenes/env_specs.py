@@ -10,8 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from morphgen.arguments import truth, whole_number
-from morphgen.errors import TaskError, nearest
+from morphgen.errors import TaskError, nearest, truth, whole_number
 from morphgen.fitting.replace_collision import as_primitives
 from morphgen.grammar.library import Library, LibraryFolders, default_library
 from morphgen.grammar.robot_source import RobotLike, resolve_robot

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, TypedDict, TypeVar, get_args
 
 import torch
 
-from morphgen.arguments import whole_number
 from morphgen.encoding.tokens import default_max_links
-from morphgen.errors import TaskError, nearest
+from morphgen.errors import TaskError, nearest, whole_number
 from morphgen.grammar.library import LibraryFolders, default_library, library_folders
 from morphgen.grammar.robot_source import RobotLike, is_one_robot, robot_list
 from morphgen.progress import own_progress, show_progress

@@ -8,7 +8,7 @@ from helpers.caching import once
 from helpers.splits import LIBRARY, combined
 from morphgen.benchmark import survey
 from morphgen.benchmark.split_folder import build_split
-from morphgen.splits.candidates import RobotFactory
+from morphgen.splits.split import RobotFactory
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from helpers.splits import LIBRARY, TEST, TRAIN, combined, member, split
-from morphgen.benchmark import audit as audit_module
-from morphgen.benchmark.audit import audit
+from morphgen.benchmark import survey as audit_module
 from morphgen.benchmark.survey import (
+    audit,
     compare_members,
     different_members,
     paper_row,
@@ -25,7 +25,7 @@ from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.sampling import sample_robot
 from morphgen.grammar.syntax import Derivation
 from morphgen.progress import show_progress
-from morphgen.splits.split_file import split_names
+from morphgen.splits.split import split_names
 
 
 def finding_keys(example_split):

@@ -10,7 +10,6 @@ import morphgen
 from helpers.generated_splits import LIBRARY, derivations, names, order, require_sound
 from helpers.grammars import grammar, shipped
 from morphgen.benchmark import generate
-from morphgen.benchmark.audit import audit
 from morphgen.benchmark.generate import (
     composition,
     extrapolation,
@@ -24,15 +23,15 @@ from morphgen.benchmark.regimes import (
     regime_findings,
     structure,
 )
+from morphgen.benchmark.survey import audit
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.request import parse_words
 from morphgen.grammar.syntax import parse_derivation
 from morphgen.model.findings import Finding
 from morphgen.progress import show_progress
-from morphgen.splits import candidates
-from morphgen.splits.candidates import RobotFactory, SampledRecipe, recipe_of
-from morphgen.splits.split import Member, Split
+from morphgen.splits import split as split_module
+from morphgen.splits.split import Member, RobotFactory, SampledRecipe, Split, recipe_of
 
 
 def points(members):
@@ -223,7 +222,7 @@ def test_robots_are_built_from_the_rounded_numbers_of_their_derivation():
 
 def test_a_robot_that_fails_its_checks_is_an_error(monkeypatch):
     findings = [Finding("overlap", "error", "link a", "too deep", "move it")]
-    monkeypatch.setattr(candidates, "check", lambda robot: findings)
+    monkeypatch.setattr(split_module, "check", lambda robot: findings)
     with pytest.raises(BenchmarkError, match="gantry-cube: overlap at link a: too deep"):
         RobotFactory(LIBRARY)(recipe_of(("base=gantry", "ee=cube"), LIBRARY))
 

@@ -8,7 +8,6 @@ import pytest
 from helpers.generated_splits import LIBRARY, order
 from helpers.grammars import grammar
 from helpers.splits import member, split
-from morphgen.benchmark.audit import audit
 from morphgen.benchmark.hold_out import (
     hold_out,
     hold_out_findings,
@@ -17,13 +16,19 @@ from morphgen.benchmark.hold_out import (
     unique_names,
 )
 from morphgen.benchmark.regimes import pattern_robots
+from morphgen.benchmark.survey import audit
 from morphgen.errors import BenchmarkError, CompositionError, PartError
 from morphgen.grammar.request import parse_words
 from morphgen.grammar.syntax import parse_derivation
 from morphgen.progress import show_progress
-from morphgen.splits.candidates import RobotFactory
-from morphgen.splits.split import Member, compose_member, split_id
-from morphgen.splits.split_file import parse_split, split_text
+from morphgen.splits.split import (
+    Member,
+    RobotFactory,
+    compose_member,
+    parse_split,
+    split_id,
+    split_text,
+)
 
 pytestmark = pytest.mark.usefixtures("composed_once")
 

@@ -21,9 +21,16 @@ from morphgen.errors import BenchmarkError
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import pin
-from morphgen.splits.candidates import RobotFactory, SampledRecipe, recipe_of
-from morphgen.splits.split import SIDES
-from morphgen.splits.split_file import find_split, read_split, split_names, split_text
+from morphgen.splits.split import (
+    SIDES,
+    RobotFactory,
+    SampledRecipe,
+    find_split,
+    read_split,
+    recipe_of,
+    split_names,
+    split_text,
+)
 
 LIBRARY = default_library()
 ARTICULATED = ("dial", "door", "drawer")

@@ -21,8 +21,7 @@ from morphgen.benchmark.scores.submission import (
 )
 from morphgen.errors import BenchmarkError
 from morphgen.rl.scores import mean_interval, success_interval
-from morphgen.splits.split import split_id
-from morphgen.splits.split_file import read_split
+from morphgen.splits.split import read_split, split_id
 
 TRAINING = {"simulator": "warp", "transitions": 30_000_000}
 

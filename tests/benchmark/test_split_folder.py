@@ -21,8 +21,7 @@ from morphgen.formats import zip_files as npz_files
 from morphgen.grammar.compose import compose
 from morphgen.progress import show_progress
 from morphgen.splits import split as split_module
-from morphgen.splits.split import compose_member, split_id
-from morphgen.splits.split_file import read_split, split_text
+from morphgen.splits.split import compose_member, read_split, split_id, split_text
 
 
 def test_the_folder_has_the_name_of_the_split(tmp_path, example_split):

@@ -21,7 +21,7 @@ from morphgen.benchmark.split_folder import build_split, load_split_folder
 from morphgen.errors import BenchmarkError, MorphgenError, TaskError
 from morphgen.grammar.library import default_library
 from morphgen.progress import show_progress
-from morphgen.splits.split_file import read_split, split_names
+from morphgen.splits.split import read_split, split_names
 from morphgen.tasks import free_space
 from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.goals import goal_sets as packaged_sets

@@ -10,7 +10,7 @@ from helpers.commands import tree
 from helpers.splits import TEST, TRAIN, combined, member
 from morphgen.cli import main, progress
 from morphgen.grammar.library import LIBRARY_VARIABLE
-from morphgen.splits.split_file import write_split
+from morphgen.splits.split import write_split
 
 
 @pytest.fixture(autouse=True)

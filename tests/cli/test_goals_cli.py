@@ -6,7 +6,7 @@ import pytest
 
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
 from morphgen.benchmark.split_folder import build_split
-from morphgen.splits.split_file import split_text
+from morphgen.splits.split import split_text
 from morphgen.tasks import free_space
 from morphgen.tasks.registry import TASKS
 

@@ -21,7 +21,7 @@ from morphgen import cli
 from morphgen.api.export import FILES
 from morphgen.cli.command import whole_number
 from morphgen.errors import MorphgenError
-from morphgen.splits.split_file import split_text
+from morphgen.splits.split import split_text
 from morphgen.tasks.registry import TASKS
 
 ABBREVIATIONS = {

@@ -11,8 +11,7 @@ from helpers.commands import tree
 from helpers.splits import TEST, TRAIN, combined, member
 from morphgen.benchmark.split_folder import load_split_folder
 from morphgen.benchmark.survey import paper_rows
-from morphgen.splits.split import split_id
-from morphgen.splits.split_file import read_split, split_names, split_text
+from morphgen.splits.split import read_split, split_id, split_names, split_text
 from morphgen.tasks.goals.split_goals import read_goals
 
 INTERPOLATION = ("split", "new", "interpolation", "--grammar", "cubes", "--train", "3")

@@ -14,7 +14,7 @@ from helpers.splits import TRAIN, combined, member
 from helpers.submissions import data
 from morphgen.benchmark.scores.submission import EvalProtocol, expected_robots
 from morphgen.grammar.library import default_library
-from morphgen.splits.split_file import read_split, split_text
+from morphgen.splits.split import read_split, split_text
 
 RELEASE = ("split", "release", "--no-goals")
 

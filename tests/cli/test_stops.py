@@ -15,7 +15,7 @@ import pytest
 from helpers.commands import heed_ctrl_c, tree
 from helpers.runs import small_split
 from morphgen.formats import files
-from morphgen.splits.split_file import split_text
+from morphgen.splits.split import split_text
 
 WRITERS = {
     **{f"export {f}": ["export", "prims", "--format", f] for f in ("urdf", "mjcf", "sdf", "ros2")},

@@ -18,8 +18,7 @@ from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, read_config
 from morphgen.rl.runs.robot_source import FILE, fresh_source, members, read_drawn, specs_of
 from morphgen.rl.runs.training import METRICS, _StopRequest, read_metrics
 from morphgen.rl.shipped_policies import POLICIES, ShippedPolicy, policies_for
-from morphgen.splits.split import Member
-from morphgen.splits.split_file import write_split
+from morphgen.splits.split import Member, write_split
 from morphgen.tasks.goals.split_goals import read_goals
 from morphgen.tasks.scenes.env_specs import GoalConfig
 

@@ -13,12 +13,10 @@ import numpy as np
 import pytest
 from packaging.requirements import Requirement
 
-from morphgen import doctor
 from morphgen.benchmark import release, split_folder
 from morphgen.benchmark.scores import submission
-from morphgen.cli import doctor as cli_doctor
-from morphgen.cli import main
-from morphgen.doctor import Entry, attempt
+from morphgen.cli import doctor, main
+from morphgen.cli.doctor import Entry, attempt
 from morphgen.encoding.robot_hash import digest, robot_hash
 from morphgen.encoding.tokens import FREQUENCIES, KINDS, LAYOUT, MAX_LINKS, SHAPES, tokens
 from morphgen.errors import MissingDependencyError, PartError
@@ -41,8 +39,7 @@ from morphgen.rl.runs import robot_source
 from morphgen.rl.runs.robot_source import split_source
 from morphgen.rl.shipped_policies import POLICIES
 from morphgen.splits import split
-from morphgen.splits.split import split_id
-from morphgen.splits.split_file import read_split, split_names
+from morphgen.splits.split import read_split, split_id, split_names
 from morphgen.tasks.goals import split_goals
 from morphgen.tasks.goals.goal_sets import FOLDER, INDEX
 from morphgen.tasks.registry import TASKS
@@ -70,7 +67,7 @@ def test_this_installation_is_sound(capsys):
 @pytest.mark.parametrize(("status", "code"), [("warning", 0), ("absent", 0), ("error", 1)])
 def test_an_error_makes_the_exit_code_1(status, code, monkeypatch, capsys):
     entries = [("part", Entry("a", "ok", "b", {"c": 1})), ("part", Entry("d", status, "e"))]
-    monkeypatch.setattr(cli_doctor, "diagnose", lambda: iter(entries))
+    monkeypatch.setattr(doctor, "diagnose", lambda: iter(entries))
     assert main(["doctor"]) == code
     assert capsys.readouterr().out.splitlines()[-1].startswith("NOT SOUND" if code else "sound")
     assert main(["doctor", "--json"]) == code

@@ -26,7 +26,7 @@ from morphgen.rl.baselines.scripted_articulated import Scripted
 from morphgen.rl.baselines.scripted_push import Push, PushPlanner, ScriptedPush, ToolKinematics
 from morphgen.rl.baselines.simple import GAIN, JacobianColumns, column_steps
 from morphgen.rl.inference import run_episodes
-from morphgen.splits.split_file import read_split
+from morphgen.splits.split import read_split
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.free_space import RESOLUTION, FreeSpace

@@ -34,8 +34,7 @@ from morphgen.rl.runs import training
 from morphgen.rl.runs.checkpoint import CHECKPOINT, read_checkpoint, read_config
 from morphgen.rl.runs.robot_source import draw, drawn_source, robot_source, specs_of, split_source
 from morphgen.rl.runs.training import ExecutionConfig, TrainingBatches, read_metrics, train
-from morphgen.splits.split import Member, compose_member
-from morphgen.splits.split_file import read_split, split_names, write_split
+from morphgen.splits.split import Member, compose_member, read_split, split_names, write_split
 from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig, load_robot

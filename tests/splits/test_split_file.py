@@ -12,12 +12,14 @@ from hypothesis import strategies as st
 
 from helpers.commands import tree
 from morphgen.errors import BenchmarkError, MorphgenError
-from morphgen.splits.split import Member, Split, split_id
-from morphgen.splits.split_file import (
+from morphgen.splits.split import (
+    Member,
+    Split,
     find_split,
     parse_split,
     read_split,
     read_split_file,
+    split_id,
     split_text,
     write_split,
 )

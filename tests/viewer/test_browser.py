@@ -9,7 +9,7 @@ from helpers.pages import choose, field, nodes, press, wait_until
 from helpers.runs import QUIET, small_config, small_source
 from morphgen.formats.bundle import read_bundle
 from morphgen.rl.runs.training import train
-from morphgen.splits.split_file import read_split
+from morphgen.splits.split import read_split
 
 pytestmark = pytest.mark.slow
 

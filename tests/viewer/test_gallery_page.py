@@ -18,7 +18,7 @@ from morphgen.model.geometry import Capsule, Shape
 from morphgen.model.kinematics import forward_kinematics, joint_limits
 from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Link, Robot
-from morphgen.splits.split_file import find_split, read_split
+from morphgen.splits.split import find_split, read_split
 from morphgen.viewer.app.address import AddressError
 from morphgen.viewer.pages.gallery import make_member, parse_range, save_split
 from morphgen.viewer.pages.population import (

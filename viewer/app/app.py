@@ -20,7 +20,7 @@ from morphgen.grammar.grammar_file import SUFFIX, grammar_names
 from morphgen.grammar.library import default_library
 from morphgen.grammar.robot_source import is_robot_folder
 from morphgen.rl.demonstrations.lerobot import is_data_set
-from morphgen.splits.split_file import split_names
+from morphgen.splits.split import split_names
 from morphgen.viewer import markup, robot_uri
 from morphgen.viewer.app.address import CHOSEN, Address, load_page, parse_address, parse_count
 from morphgen.viewer.app.frame import call

@@ -20,8 +20,18 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.grammar_file import grammar_names
 from morphgen.grammar.syntax import parse_derivation
 from morphgen.rl.demonstrations.lerobot import RECORDING
-from morphgen.splits.split import COMPOSED, HOLD_OUT, REGIMES, SIDES, Member, Regime, Split
-from morphgen.splits.split_file import require_split_name, split_names, write_split
+from morphgen.splits.split import (
+    COMPOSED,
+    HOLD_OUT,
+    REGIMES,
+    SIDES,
+    Member,
+    Regime,
+    Split,
+    require_split_name,
+    split_names,
+    write_split,
+)
 from morphgen.tasks.registry import TASKS
 from morphgen.viewer import markup, robot_rows
 from morphgen.viewer.app.address import Address, AddressError, parse_count

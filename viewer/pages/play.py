@@ -17,7 +17,7 @@ from morphgen.errors import MorphgenError, TaskError, nearest
 from morphgen.grammar.robot_source import is_set_folder
 from morphgen.rl.baselines import baselines_for
 from morphgen.rl.shipped_policies import is_named, policies_for, zero_shot_policy
-from morphgen.splits.split_file import split_names
+from morphgen.splits.split import split_names
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.task import TaskConfig
 from morphgen.typing import Array

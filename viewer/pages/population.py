@@ -22,8 +22,7 @@ from morphgen.formats.bundle import split_colours
 from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
 from morphgen.progress import report
-from morphgen.splits.split import split_id
-from morphgen.splits.split_file import split_names
+from morphgen.splits.split import split_id, split_names
 from morphgen.typing import Array
 from morphgen.viewer import markup, robot_uri
 from morphgen.viewer.app.address import MAX_COMPARED, Address, parse_count

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from morphgen.benchmark.audit import Audit, audit_survey
 from morphgen.benchmark.survey import (
+    Audit,
     Fault,
     SurveyedRobot,
+    audit_survey,
     compare_members,
     different_members,
     survey_robot,

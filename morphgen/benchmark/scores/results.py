@@ -47,8 +47,7 @@ from morphgen.rl.scores import (
     score_decimals,
     seeds_success_interval,
 )
-from morphgen.splits.split import SIDES, Side, Split, split_id
-from morphgen.splits.split_file import read_split, split_names
+from morphgen.splits.split import SIDES, Side, Split, read_split, split_id, split_names
 from morphgen.tables import table
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
