@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from helpers.caching import once
+from helpers.goal_sets import once
 from helpers.splits import LIBRARY, combined
 from morphgen.benchmark import survey
 from morphgen.benchmark.split_folder import build_split

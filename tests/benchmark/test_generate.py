@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial import Delaunay
 
 import morphgen
-from helpers.generated_splits import LIBRARY, derivations, names, order, require_sound
 from helpers.grammars import grammar, shipped
+from helpers.splits import LIBRARY, derivations, names, order, require_sound
 from morphgen.benchmark import generate
 from morphgen.benchmark.generate import (
     composition,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers.generated_splits import LIBRARY, derivations, names, order, require_sound
+from helpers.splits import LIBRARY, derivations, names, order, require_sound
 from morphgen.benchmark.generate import (
     composition,
     hold_out_combinations,

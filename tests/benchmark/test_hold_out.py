@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from helpers.generated_splits import LIBRARY, order
 from helpers.grammars import grammar
-from helpers.splits import member, split
+from helpers.splits import LIBRARY, member, order, split
 from morphgen.benchmark.hold_out import (
     hold_out,
     hold_out_findings,

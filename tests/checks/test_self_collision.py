@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from helpers.composed import composed
-from helpers.robots import arm, chain
-from helpers.simulators import needs_pybullet
+from helpers.robots import arm, chain, composed
+from helpers.scenes import needs_pybullet
 from morphgen.checks import conformance as module
 from morphgen.checks.conformance import hold_files
 from morphgen.checks.self_collision import (

@@ -12,8 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 import morphgen
 from helpers.faulty_robots import with_joint
-from helpers.robots import arm
-from helpers.tokens import shapes_of
+from helpers.robots import arm, shapes_of
 from morphgen.encoding.similarity import (
     FIXED,
     MEASURES,

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers.robots import arm
-from helpers.tokens import arm_tokens, field_of, shapes_of
+from helpers.robots import arm, arm_tokens, field_of, shapes_of
 from morphgen.encoding.tokens import (
     LAYOUT,
     MAX_LINKS,

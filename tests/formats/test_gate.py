@@ -17,8 +17,8 @@ from trimesh.exchange.stl import export_stl
 
 from helpers.commands import run_python
 from helpers.fuzzing import MEMORY_MIB, Runner
+from helpers.pages import archive
 from helpers.robots import arm
-from helpers.uploads import archive
 from morphgen.api.checks import conform
 from morphgen.checks import check
 from morphgen.checks.conformance import conformance

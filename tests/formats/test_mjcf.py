@@ -10,10 +10,9 @@ import pytest
 import trimesh
 
 import morphgen
-from helpers.composed import composed
 from helpers.mjcf import TWO_JOINTS, inertia_in_mujoco, read, refusal, write
 from helpers.parts import write_part
-from helpers.robots import arm, rod
+from helpers.robots import arm, composed, rod
 from morphgen.errors import FormatError
 from morphgen.formats.bundle import read_bundle, read_robot, write_bundle
 from morphgen.formats.description import is_mjcf, read_description

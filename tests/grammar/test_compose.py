@@ -9,8 +9,8 @@ from operator import attrgetter
 import numpy as np
 import pytest
 
-from helpers.composed import LIBRARY, composed, derive, joined
 from helpers.parts import write_part
+from helpers.robots import LIBRARY, composed, derive, joined
 from morphgen.checks import check
 from morphgen.checks.conformance import conformance
 from morphgen.checks.readers import LOADERS

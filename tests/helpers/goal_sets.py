@@ -1,4 +1,4 @@
-"""Goal sets and environment specifications of a robot, by the constants of a task."""
+"""Goal sets and environment specifications of a robot, and functions called once."""
 
 from morphgen.tasks.configs import ReachConfig
 from morphgen.tasks.goals.goal_sets import goal_set
@@ -25,3 +25,16 @@ def draw_spec(robot, config, *, obstacles=False, seed=0, cache=None):
 def sample_goals(body, cache, *, obstacles=False, seed=0, config=CONFIG, ground=LIFTED):
     """Return the goal set of a lifted robot, by default a small one."""
     return draw_goals(body, config, obstacles=obstacles, seed=seed, ground=ground, cache=cache)
+
+
+def once(function, key):
+    """Return a function that calls another one once for each key of its arguments."""
+    known = {}
+
+    def cached(*args, **options):
+        at = key(*args, **options)
+        if at not in known:
+            known[at] = function(*args, **options)
+        return known[at]
+
+    return cached

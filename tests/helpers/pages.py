@@ -1,7 +1,9 @@
-"""Use the controls of a page of the viewer in a browser, and inspect the viewer behind it."""
+"""Use the controls of a page of the viewer in a browser, and what tests upload to it."""
 
 import gc
+import io
 import time
+import zipfile
 
 FIELD = "xpath=ancestor::*[.//input][1]//input"
 
@@ -43,3 +45,15 @@ def click_on(node, **more):
     message |= {"instance_index": None, "modifier": None, "screen_pos": [0.5, 0.5]}
     ray = {"ray_origin": [1.0, 0.0, 0.0], "ray_direction": [-1.0, 0.0, 0.0]}
     return {**message, **ray, **more}
+
+
+URDF = b'<robot name="r"><link name="a"/></robot>'
+
+
+def archive(files, how=zipfile.ZIP_STORED):
+    """Return a zip of files by their paths."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", how) as made:
+        for name, data in files.items():
+            made.writestr(name, data)
+    return content.getvalue()

@@ -1,8 +1,12 @@
-"""Small robots that tests build in code."""
+"""Small robots that tests build in code or compose by words, and tokens of the test arm."""
 
 from dataclasses import replace
 from itertools import pairwise
 
+from morphgen.encoding.tokens import LAYOUT, tokens
+from morphgen.grammar.compose import compose, join
+from morphgen.grammar.library import default_library
+from morphgen.grammar.request import parse_request
 from morphgen.model.geometry import Box, Cylinder, Pose, Shape, Sphere
 from morphgen.model.inertia import with_inertia
 from morphgen.model.robot import Frame, Inertial, Joint, Link, Mimic, Robot
@@ -78,3 +82,34 @@ def finger(mass: float = 2.0) -> Robot:
         Joint("up", "prismatic", "carriage", "ball", axis=(0, 0, 1), **slide),
     )
     return Robot("finger", links, joints, home=(0.0, 0.0))
+
+
+LIBRARY = default_library()
+
+
+def derive(text, library=LIBRARY):
+    return parse_request(text.split(), library)
+
+
+def composed(text):
+    return compose(derive(text), LIBRARY, "robot")
+
+
+def joined(text):
+    return join(derive(text), LIBRARY, "robot")
+
+
+FIELDS = {field.name: field.columns for field in LAYOUT}
+
+
+def shapes_of(robot):
+    return {link.name: link.collisions[0] for link in robot.links if link.collisions}
+
+
+def arm_tokens(**changes):
+    robot = replace(arm(), **changes)
+    return tokens(robot, shapes_of(robot))
+
+
+def field_of(token_array, name):
+    return token_array[..., FIELDS[name]]

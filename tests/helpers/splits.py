@@ -1,11 +1,13 @@
-"""Small splits that tests write in code."""
+"""Small splits that tests write in code, and requests for others."""
 
+from morphgen.benchmark.generate import SplitRequest
+from morphgen.benchmark.regimes import regime_findings
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.grammar.compose import compose
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
 from morphgen.grammar.syntax import parse_derivation
-from morphgen.splits.split import COMPOSED, Member, Split
+from morphgen.splits.split import COMPOSED, Member, Split, compose_member
 
 LIBRARY = default_library()
 
@@ -33,3 +35,25 @@ TEST = ("base=planar ee=plane",)
 def combined(train=TRAIN, test=TEST, **more):
     """Return a valid composition split of robots without meshes."""
     return split(train, test, **more)
+
+
+LIBRARY = default_library()
+
+
+def order(*train, test=1, **changes):
+    return SplitRequest("mine", train, test, **changes)
+
+
+def derivations(members):
+    return [parse_derivation(member.derivation) for member in members]
+
+
+def names(members):
+    return [member.name for member in members]
+
+
+def require_sound(split):
+    """Assert that the robots can be composed and that the rules of the regime hold."""
+    for member in (*split.train, *split.test):
+        assert compose_member(member, LIBRARY).name == member.name
+    assert regime_findings(split, LIBRARY) == ()

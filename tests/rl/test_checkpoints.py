@@ -5,8 +5,7 @@ import copy
 import pytest
 import torch
 
-from helpers.learners import equal, learner, stored, untimed, weights
-from helpers.line_batch import OnALine
+from helpers.line_batch import OnALine, equal, learner, stored, untimed, weights
 from morphgen.errors import TaskError
 from morphgen.rl.runs.checkpoint import packed
 from morphgen.rl.runs.training import load_networks, resume_learner, state_of

@@ -10,9 +10,7 @@ import pytest
 import torch
 
 from helpers.goal_sets import draw_spec
-from helpers.resets import reset_envs
-from helpers.scenes import ball, robot
-from helpers.simulators import PYBULLET
+from helpers.scenes import PYBULLET, ball, reset_envs, robot
 from morphgen.grammar.library import default_library
 from morphgen.model.geometry import Box, Pose, Shape
 from morphgen.model.kinematics import joint_limits

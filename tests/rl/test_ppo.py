@@ -13,8 +13,7 @@ from torch._dynamo.exc import TorchDynamoException
 
 from helpers.device_reads import device_reads
 from helpers.goal_sets import draw_spec
-from helpers.learners import SMALL, equal, learner, weights
-from helpers.line_batch import OnALine
+from helpers.line_batch import SMALL, OnALine, equal, learner, weights
 from helpers.scenes import robot
 from morphgen.errors import TaskError
 from morphgen.rl import ppo

@@ -15,8 +15,7 @@ import morphgen
 from helpers import runs
 from helpers.commands import tree
 from helpers.grammars import shipped
-from helpers.learners import learner
-from helpers.line_batch import OnALine
+from helpers.line_batch import OnALine, learner
 from helpers.runs import PPO, QUIET, after, small_config, small_source, untimed, weights
 from helpers.splits import member, split
 from morphgen.cli import main

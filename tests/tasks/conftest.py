@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from helpers.caching import once
+from helpers.goal_sets import once
 from helpers.robots import arm
 from morphgen.checks.self_collision import survey_collisions
 from morphgen.tasks.scenes.env_specs import load_robot

@@ -10,9 +10,8 @@ import pytest
 import torch
 
 import morphgen
-from helpers.resets import reset_envs
 from helpers.robots import arm
-from helpers.scenes import robot
+from helpers.scenes import reset_envs, robot
 from helpers.splits import member, split
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.encoding.tokens import tokens

@@ -10,9 +10,17 @@ import pytest
 import torch
 
 from helpers.faulty_robots import with_joint
-from helpers.resets import homes, reset_envs, state
 from helpers.robots import arm, finger
-from helpers.scenes import mixed_scenes, push_scene, reach_scene, real_arm_scene, robot
+from helpers.scenes import (
+    homes,
+    mixed_scenes,
+    push_scene,
+    reach_scene,
+    real_arm_scene,
+    reset_envs,
+    robot,
+    state,
+)
 from morphgen.errors import SimulationError
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import forward_kinematics, joint_limits

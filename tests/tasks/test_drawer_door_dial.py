@@ -8,9 +8,7 @@ import pytest
 import torch
 
 from helpers.goal_sets import draw_goals, draw_spec
-from helpers.objects import AT, EDGE, POST, door, drawer, rod
-from helpers.scenes import robot
-from helpers.simulators import PYBULLET
+from helpers.scenes import AT, EDGE, POST, PYBULLET, door, drawer, robot, rod
 from morphgen.errors import NoGoalsError, PartError, SimulationError, TaskError
 from morphgen.model.geometry import Box, Mesh, Pose, Shape
 from morphgen.model.kinematics import joint_limits

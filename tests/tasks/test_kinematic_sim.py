@@ -9,10 +9,18 @@ import torch
 
 from helpers.faulty_robots import with_joint
 from helpers.goal_sets import draw_spec
-from helpers.joint_targets import SECOND, full_speed, random_walk, smooth_walk
-from helpers.resets import put_home, reset_envs
 from helpers.robots import arm, finger
-from helpers.scenes import PAPER_ROBOTS, reach_scene, robot
+from helpers.scenes import (
+    PAPER_ROBOTS,
+    SECOND,
+    full_speed,
+    put_home,
+    random_walk,
+    reach_scene,
+    reset_envs,
+    robot,
+    smooth_walk,
+)
 from morphgen.errors import SimulationError, TaskError
 from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.kinematics import forward_kinematics, frame_pose, joint_limits

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.simulators import needs_pybullet
+from helpers.scenes import needs_pybullet
 from morphgen.tasks import make_batch
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.configs import PushConfig, ReachConfig

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from helpers.goal_sets import draw_spec
-from helpers.objects import door
 from helpers.robots import arm
+from helpers.scenes import door
 from morphgen.errors import FormatError
 from morphgen.model.geometry import Pose
 from morphgen.tasks import renderer

@@ -10,18 +10,25 @@ import pytest
 import torch
 
 from helpers.faulty_robots import with_joint
-from helpers.joint_targets import SECOND, drive, held, smooth_walk
-from helpers.resets import homes, put_home, reset_envs, state
 from helpers.robots import arm, finger
 from helpers.scenes import (
     PAPER_ROBOTS,
+    PYBULLET,
+    SECOND,
+    drive,
+    held,
+    homes,
     mixed_scenes,
+    needs_pybullet,
     push_scene,
+    put_home,
     reach_scene,
     real_arm_scene,
+    reset_envs,
     robot,
+    smooth_walk,
+    state,
 )
-from helpers.simulators import PYBULLET, needs_pybullet
 from morphgen.checks.self_collision import adjacent_pairs, untested_pairs
 from morphgen.errors import SimulationError
 from morphgen.formats.mjcf.write import to_spec

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.joint_targets import SECOND, smooth_walk
-from helpers.resets import homes, put_home
-from helpers.scenes import ball, push_scene, robot
+from helpers.scenes import SECOND, ball, homes, push_scene, put_home, robot, smooth_walk
 from morphgen.errors import SimulationError, TaskError
 from morphgen.model.geometry import Box, Pose, Shape
 from morphgen.model.robot import sorted_pair

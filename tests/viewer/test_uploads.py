@@ -12,8 +12,8 @@ import pytest
 import trimesh
 from PIL import Image
 
+from helpers.pages import URDF, archive
 from helpers.robots import arm
-from helpers.uploads import URDF, archive
 from helpers.viser_client import PlainClient
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.errors import MorphgenError
