@@ -18,6 +18,7 @@ from morphgen.model.robot import Robot
 from morphgen.model.tree import rigid_groups
 from morphgen.tasks.sim.articulated import ArticulatedObject, ground_contact_links
 from morphgen.tasks.sim.base import (
+    CONTROL_PERIOD,
     GAIN,
     GRAVITY,
     SUBSTEPS,
@@ -62,6 +63,16 @@ _LINKS, _ROOT, _STATIC, _BLOCK, _ARTICULATED = 1, 2, 4, 8, 16
 articulated object."""
 
 
+_FINAL_RESPONSE = constant(1 - (1 - VELOCITY_GAIN) ** SUBSTEPS)
+"""Fraction of a velocity change that motors have made at the end of a control step."""
+_MEAN_RESPONSE = constant(
+    1 - sum((1 - VELOCITY_GAIN) ** k for k in range(1, SUBSTEPS + 1)) / SUBSTEPS
+)
+"""Mean of that fraction over the physics steps of a control step."""
+_RESPONSE, _BANDWIDTH, _TWO = map(constant, (TIMESTEP * BANDWIDTH, BANDWIDTH, 2))
+_TIMESTEP, _SUBSTEPS, _PERIOD = map(constant, (TIMESTEP, SUBSTEPS, CONTROL_PERIOD))
+
+
 _MOVABLE = (pybullet.JOINT_REVOLUTE, pybullet.JOINT_PRISMATIC)
 FROM_BULLET, _TO_BULLET = [0, 1, 2, 6, 3, 4, 5], [0, 1, 2, 4, 5, 6, 3]
 """Columns of a pose in morphgen's order, and in PyBullet's, whose quaternions have w last."""
@@ -96,7 +107,7 @@ def limited_speeds(robot: Robot) -> list[float]:
 
 
 class MotorForces:
-    """Force limits of the motors of many robots, so that arms yield under contact.
+    """Force limits of a robot's motors, so that arms yield under contact.
 
     A velocity motor pulls with all its effort, as if it were rigid. The law of
     ``morphgen.model.dynamics`` is a spring and a damper; so a motor j may pull as hard as these do
@@ -106,28 +117,13 @@ class MotorForces:
     around: up to sqrt(M_jj M_kk) v_k^2.
     """
 
-    def __init__(self, robots: Sequence[Robot], efforts: Sequence[float]) -> None:
-        """Compute the inertia of each robot; efforts are the largest force of each row [N m, N]."""
+    def __init__(self, robot: Robot, efforts: Sequence[float]) -> None:
+        """Compute the inertia; efforts are the largest forces of the movable joints [N m or N]."""
         self._efforts = np.array(efforts, dtype=np.float64)
-        max_dof = max((robot.dof for robot in robots), default=0)
-        self._pull = np.zeros((max_dof, len(self._efforts)))
-        """Force of each row per acceleration of each independent joint; padded with zeros."""
-        self._row = np.zeros((max_dof, len(self._efforts)), np.intp)
-        """Row of that independent joint."""
-        self._swing = np.zeros_like(self._pull)
-        """Force of each row of a mimic joint per squared velocity of each independent joint."""
-        farthest: list[float] = []
-        inertias: dict[int, tuple[Array, Array]] = {}
-        for robot in robots:
-            if id(robot) not in inertias:
-                inertias[id(robot)] = _inertia(robot)
-            start, end = len(farthest), len(farthest) + len(robot.movable_joints)
-            inertia, swing = inertias[id(robot)]
-            self._pull[: robot.dof, start:end] = GAIN * inertia
-            self._swing[: robot.dof, start:end] = GAIN * swing
-            self._row[: robot.dof, start:end] = [[start + row] for row in robot.independent_rows]
-            farthest.extend(farthest_targets(robot, robot.movable_joints))
-        self._farthest = np.array(farthest)
+        inertia, swing = _inertia(robot)
+        self._pull, self._swing = GAIN * inertia, GAIN * swing
+        self._rows = robot.independent_rows
+        self._farthest = np.array(farthest_targets(robot, robot.movable_joints))
         self._has_mimic_joints = bool(self._swing.any())
 
     def limits(self, errors: Sequence[Array], velocities: Sequence[Array]) -> Array:
@@ -140,11 +136,10 @@ class MotorForces:
         dampers = [_DAMPER * v for v in velocities]
         begin, end = (np.abs(k - d) for k, d in zip(springs, dampers, strict=True))
         accelerations = np.maximum(begin, end) + _SLACK * (np.abs(springs[0]) + np.abs(dampers[0]))
-        forces = self._pull * accelerations[self._row]
+        forces = self._pull * accelerations[self._rows, None]
         if self._has_mimic_joints:
             fastest = np.maximum(np.abs(velocities[0]), np.abs(velocities[1]))
-            forces += self._swing * (fastest**2)[self._row]
-        # Along the first axis NumPy adds one row after the other, so that padding changes no bit.
+            forces += self._swing * (fastest**2)[self._rows, None]
         return np.minimum(np.add.reduce(forces, axis=0), self._efforts)
 
 
@@ -176,8 +171,8 @@ class BulletScene:
     Motors. PyBullet's position control, v' = v - kd v + kp e / dt in every physics step, follows
     the control law only where nothing else moves the joint: the v on the right already includes the
     step's gravity and Coriolis acceleration, of which kd removes only a part. So motors control the
-    velocity during a control step, with no more force than a spring and a damper would exert;
-    ``BulletSimulation`` computes the velocity, ``MotorForces`` the force. The robot carries its own
+    velocity during a control step, with no more force than a spring and a damper would exert
+    (``MotorForces``). The robot carries its own
     weight: the world has no gravity, and the block's weight is an external force. One call makes
     all substeps; the motors act in each, but PyBullet computes their impulse limits with the time
     of the whole call, hence forces are divided by ``SUBSTEPS``. A mimic joint is a motor that
@@ -256,8 +251,9 @@ class BulletScene:
         joints = {info[1].decode(): info[0] for info in infos}
         links = {merged.root.name: -1} | {info[12].decode(): info[0] for info in infos}
         self.driven = [joints[merged.joints[k].name] for k in merged.movable_joints]
-        self.efforts = [_effort(merged, k) for k in merged.movable_joints]
-        fastest = max(limited_speeds(merged), default=math.inf)  # PyBullet has one limit a robot
+        efforts = [_effort(merged, k) for k in merged.movable_joints]
+        speeds = limited_speeds(merged)
+        fastest = max(speeds, default=math.inf)  # PyBullet has one limit a robot
         if math.isfinite(fastest):
             pybullet.changeDynamics(
                 self.robot, -1, maxJointVelocity=OVERSPEED * fastest, **self._client
@@ -273,6 +269,14 @@ class BulletScene:
                 pybullet.setCollisionFilterPair(
                     self.robot, self.robot, links[a], links[b], 0, **self._client
                 )
+        self._forces = MotorForces(self._scene.robot, efforts)
+        self._fastest = np.array(speeds)
+        # Every movable joint follows one independent joint, its leader: a row has one number that
+        # is not zero. A matrix product might round differently in another batch.
+        matrix, self._offset = merged.mimic_map
+        leaders = np.abs(matrix).argmax(axis=1)
+        self._gain = matrix[np.arange(len(matrix)), leaders]
+        self._leaders, self._independent = leaders, np.array(merged.independent_rows, np.intp)
         self._motors: dict[str, Any] = {
             "velocityGains": [VELOCITY_GAIN] * len(self.driven),
             **self._client,
@@ -354,12 +358,14 @@ class BulletScene:
 
     def reset(
         self,
-        positions: Sequence[float],
+        positions: Array,
         object_pose: Sequence[float],
         obstacle_poses: Sequence[Sequence[float]] | None = None,
     ) -> None:
         """Put robot, at positions of all movable joints, and block at rest; clear contacts."""
-        for joint, position in zip(self.driven, positions, strict=True):
+        self._positions = positions
+        self._velocities, self._measured = np.zeros((2, len(positions)))
+        for joint, position in zip(self.driven, positions.tolist(), strict=True):
             pybullet.resetJointState(self.robot, joint, position, **self._client)
         moved = (
             [] if obstacle_poses is None else [*zip(self._obstacles, obstacle_poses, strict=True)]
@@ -378,17 +384,52 @@ class BulletScene:
         for entry in self._groups:
             pybullet.setCollisionFilterGroupMask(*entry, **self._client)
 
-    def step(self, velocities: list[float], forces: list[float]) -> None:
-        """Advance by a control step, given velocities and force limits of all movable joints."""
-        if velocities:
-            pybullet.setJointMotorControlArray(
-                self.robot,
-                self.driven,
-                pybullet.VELOCITY_CONTROL,
-                targetVelocities=velocities,
-                forces=forces,
-                **self._motors,
-            )
+    def step(self, targets: Array) -> tuple[Array, Array]:
+        """Advance by a control step towards targets of the independent joints, (dof,).
+
+        Return their positions and velocities.
+        """
+        desired = targets[self._leaders] * self._gain + self._offset
+        ends, last = self._undisturbed(desired)
+        mean = (ends - self._positions) / _PERIOD
+        before = self._measured
+        commanded = clamp(before + (mean - before) / _MEAN_RESPONSE, self._fastest)
+        limits = self._forces.limits(
+            (desired - self._positions, desired - ends), (self._velocities, last)
+        )
+        self._simulate(commanded.tolist(), (limits / _SUBSTEPS).tolist())
+        states = pybullet.getJointStates(self.robot, self.driven, **self._client)
+        self._positions = np.array([state[0] for state in states])
+        self._measured = np.array([state[1] for state in states])
+        expected = before + (commanded - before) * _FINAL_RESPONSE
+        self._velocities = last + (self._measured - expected)
+        return self._positions[self._independent], self._measured[self._independent]
+
+    def _undisturbed(self, desired: Array) -> tuple[Array, Array]:
+        """Return positions and velocities at the end of a control step without disturbances.
+
+        Integrates the critically damped law of ``morphgen.model.dynamics`` in physics steps. Effort
+        limits and contacts are not modelled: they show in the velocity that is measured afterwards,
+        and carry over to the next step.
+        """
+        q, v = self._positions, self._velocities
+        for _ in range(SUBSTEPS):
+            v = clamp(v + _RESPONSE * (_BANDWIDTH * (desired - q) - _TWO * v), self._fastest)
+            q = q + _TIMESTEP * v
+        # Mimic joints follow where their leaders are: a leader at its effort limit is late.
+        leaders = self._independent[self._leaders]
+        return q[leaders] * self._gain + self._offset, v[leaders] * self._gain
+
+    def _simulate(self, velocities: list[float], forces: list[float]) -> None:
+        """Make a control step, given velocities and force limits of all movable joints."""
+        pybullet.setJointMotorControlArray(
+            self.robot,
+            self.driven,
+            pybullet.VELOCITY_CONTROL,
+            targetVelocities=velocities,
+            forces=forces,
+            **self._motors,
+        )
         if self.block >= 0:
             pybullet.applyExternalForce(
                 self.block,
@@ -400,16 +441,7 @@ class BulletScene:
             )
         pybullet.stepSimulation(**self._client)
 
-    def joint_states(self) -> Sequence[tuple[float, float]]:
-        """Return tuples that begin with position and velocity of the movable joints."""
-        if not self.driven:
-            return ()
-        states: Sequence[tuple[float, float]] = pybullet.getJointStates(
-            self.robot, self.driven, **self._client
-        )
-        return states
-
-    def object_state(self) -> tuple[float, ...]:
+    def object_state(self) -> Array:
         """Return position, quaternion (x, y, z, w), linear and angular velocity of the object.
 
         An articulated object has one velocity, that of its joint, which comes last.
@@ -417,11 +449,11 @@ class BulletScene:
         if self.object_joint is not None:
             q, qd, *_ = pybullet.getJointState(self.object, self.object_joint, **self._client)
             pose = self._placed_joint.poses(np.array([q]))[0, _TO_BULLET]
-            return (*pose.tolist(), *(0.0,) * 5, qd)
+            return np.array([*pose, *(0.0,) * 5, qd])
         position, quaternion = pybullet.getBasePositionAndOrientation(self.block, **self._client)
         linear, angular = pybullet.getBaseVelocity(self.block, **self._client)
         self._object_position = position
-        return (*position, *quaternion, *linear, *angular)
+        return np.array([*position, *quaternion, *linear, *angular])
 
     def close(self) -> None:
         """Free the client; a second call does nothing."""

@@ -293,7 +293,7 @@ def test_nothing_is_left_of_a_simulation(scratch, closes):
 def limits(body, error, velocity=0.0, effort=1e9):
     rows = len(body.movable_joints)
     errors, velocities = (np.broadcast_to(each, rows).astype(float) for each in (error, velocity))
-    motors = MotorForces([body], [effort] * rows)
+    motors = MotorForces(body, [effort] * rows)
     return motors.limits((errors, errors), (velocities, velocities))
 
 
