@@ -228,7 +228,6 @@ class FreeSpace:
         """Return at which poses (n, 7) the block penetrates neither an obstacle nor the base."""
         robot, poses = self.scene.robot, np.asarray(blocks, dtype=np.float64)
         fixed_names = {*self._obstacles, *(link.name for link in rigid_groups(robot)[0].links)}
-        self._require_blocks(poses, len(poses))
         near = np.flatnonzero(_may_touch(self.scene, poses))
         clear = np.ones(len(poses), dtype=np.bool_)
         clear[near] = [
@@ -305,22 +304,11 @@ class FreeSpace:
         parts = [q, np.zeros((len(q), self._num_static))]
         if blocks is not None:
             blocks = np.asarray(blocks, dtype=np.float64)
-            self._require_blocks(blocks, len(q))
             rpy = np.array([_rpy(*rotation) for rotation in blocks[:, 3:].tolist()]).reshape(-1, 3)
             parts += [blocks[:, :3], rpy[:, ::-1]]
         elif self.scene.object:
             parts.append(np.tile(_AWAY, (len(q), 1)))
         return np.concatenate(parts, axis=1)
-
-    def _require_blocks(self, blocks: Array, n: int) -> None:
-        """Require n finite poses of the block, and a block."""
-        if self.scene.object is None or blocks.shape != (n, 7):
-            raise ValueError(
-                f"blocks have shape {blocks.shape}; {n} configurations need ({n}, 7), and a scene "
-                "with a block"
-            )
-        if not np.isfinite(blocks).all():
-            raise ValueError("a pose of the block is not finite")
 
 
 @lru_cache(maxsize=256)  # a plan tests a block at a thousand places with one rotation

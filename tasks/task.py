@@ -224,10 +224,6 @@ class ObservationField:
     """Length of the vector."""
     mask: str
     """Name of the entry that marks environments with the field, shape (n,), bool."""
-    low: float = -BOUND
-    """Smallest value of a number in the vector."""
-    high: float = BOUND
-    """Largest value of a number in the vector."""
 
 
 GOAL = ObservationField("goal", 7, "goal_mask")

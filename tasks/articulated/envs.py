@@ -170,10 +170,6 @@ class ArticulatedEnvs(TaskEnvs):
         self._end = torch.zeros(len(env_spec_index), 7, device=device)  # poses at the goals
         # Points before contact, in the frames of the objects' poses.
         self._before = torch.zeros(len(env_spec_index), 3, device=device)
-        # What an episode is drawn with.
-        formulas = self.formulas
-        self._drawn_numbers = formulas.start, formulas.goal, formulas.sign, formulas.travel
-        self._drawn_vectors = formulas.surface, self._end, self._before
 
     def begin(
         self, mask: torch.Tensor, random: EpisodeRandom, layout: torch.Tensor | None
@@ -186,7 +182,10 @@ class ArticulatedEnvs(TaskEnvs):
         start_q, goal = motion[:, 0], motion[:, 1]
         travel = self.fraction * (goal - start_q).abs()
         drawn = (start_q, goal, torch.sign(goal - start_q), travel, surface, end, before)
-        for kept, new in zip((*self._drawn_numbers, *self._drawn_vectors), drawn, strict=True):
+        formulas = self.formulas
+        numbers = (formulas.start, formulas.goal, formulas.sign, formulas.travel)
+        vectors = (formulas.surface, self._end, self._before)
+        for kept, new in zip((*numbers, *vectors), drawn, strict=True):
             rows = mask if kept.ndim == 1 else mask[:, None]
             kept.copy_(torch.where(rows, new, kept))
         return self._q[self._env_spec_index, start], pose
@@ -220,20 +219,12 @@ class ArticulatedEnvs(TaskEnvs):
         formulas.travel.copy_(self.fraction * (formulas.goal - formulas.start).abs())
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """Return the part of the travel, and what the running episodes were drawn with."""
-        return {
-            "fraction": self.fraction.clone(),
-            "motion": torch.stack(self._drawn_numbers, dim=1),
-            "points": torch.cat(self._drawn_vectors, dim=1),
-        }
+        """Return the part of the travel."""
+        return {"fraction": self.fraction.clone()}
 
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Restore what ``state_dict`` returned."""
+        """Restore the part of the travel."""
         self.fraction.copy_(state["fraction"])
-        parts = torch.split(state["points"], [3, 7, 3], dim=1)
-        stored = (*state["motion"].unbind(1), *parts)
-        for kept, values in zip((*self._drawn_numbers, *self._drawn_vectors), stored, strict=True):
-            kept.copy_(values)
 
 
 def _motions(starts: ArticulatedStartSet) -> NDArray[np.float64]:

@@ -220,7 +220,7 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         first = self._without_padding(self.batch.observe())
         self.observation_space = cast(
             "gym.Space[NumpyObservation]",
-            observation_space({k: v[None] for k, v in first.items()}, fields),
+            observation_space({k: v[None] for k, v in first.items()}),
         )
         self.action_space = action_space(batch.action_kind, len(self.action_links))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from inspect import signature
 from typing import Any, TypeVar
@@ -26,7 +26,7 @@ from morphgen.tasks.renderer import SIZE, Frame, Renderer, render_state
 from morphgen.tasks.scenes.env_specs import task_configs
 from morphgen.tasks.scenes.make import BatchOptions, make_batch
 from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
-from morphgen.tasks.task import BOUND, ObservationField, TaskConfig
+from morphgen.tasks.task import BOUND, TaskConfig
 
 register_gym_envs()  # morphgen.tasks may have been imported before Gymnasium
 
@@ -57,19 +57,15 @@ def numpy_observation(observation: Observation) -> NumpyObservation:
     return entries
 
 
-def observation_space(
-    observation: NumpyObservation, fields: Iterable[ObservationField]
-) -> spaces.Dict:
+def observation_space(observation: NumpyObservation) -> spaces.Dict:
     """Return the space of one environment from an observation of a batch: boxes, and masks."""
-    bounds = {field.name: (field.low, field.high) for field in fields}
     entries: dict[str, spaces.Space[Any]] = {}
     for name, values in sorted(observation.items()):
         shape = values.shape[1:]
         if values.dtype == np.int8:
             entries[name] = spaces.MultiBinary(shape)
         else:
-            low, high = bounds.get(name, (-BOUND, BOUND))
-            entries[name] = spaces.Box(low, high, shape, np.float32)
+            entries[name] = spaces.Box(-BOUND, BOUND, shape, np.float32)
     return spaces.Dict(entries)
 
 
@@ -256,9 +252,7 @@ class TaskVector(BatchEnv, VectorEnv[NumpyObservation, Array, Array]):
         links = slice(int(torch.nonzero(is_link).max()) + 1)
         self._columns: dict[str, Any] = dict.fromkeys((*LINK_ENTRIES, "links"), links)
         self._columns |= {name: list(self.action_links) for name in ("actions", "previous_action")}
-        self.single_observation_space = observation_space(
-            self._numpy(batch.observe()), batch.groups.observation_fields
-        )
+        self.single_observation_space = observation_space(self._numpy(batch.observe()))
         self.single_action_space = action_space(batch.action_kind, len(self.action_links))
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from os import PathLike
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -83,19 +83,14 @@ def default_configs() -> tuple[TaskConfig, ...]:
     return tuple(TASKS[name].config_type() for name in IN_EVERY_FILE)
 
 
-def load_robot(
-    source: RobotLike,
-    geometry: Literal["primitive", "mesh"] = "primitive",
-    library: LibraryFolders = (),
-) -> Robot:
+def load_robot(source: RobotLike, library: LibraryFolders = ()) -> Robot:
     """Return the robot that a user names, with fitted primitives as its collision shapes.
 
     A robot has the same goals and scores whether it is named by words, by its bundle, by the
     bundle's URDF, or passed as ``morphgen.compose`` or ``morphgen.read`` returns it.
     """
     parts = default_library(library)
-    robot = resolve_robot(source, parts)
-    return as_primitives(robot, parts.folders) if geometry == "primitive" else robot
+    return as_primitives(resolve_robot(source, parts), parts.folders)
 
 
 def member_with_primitives(member: Member, library: Library) -> Robot:

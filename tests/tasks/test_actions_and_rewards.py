@@ -504,10 +504,8 @@ def test_names_are_compose_arguments(given, words):
     assert (found.name, robot_hash(found)) == (expected.name, robot_hash(expected))
 
 
-def test_collision_shapes_are_primitives_by_default():
-    for given, expected in (({}, False), ({"geometry": "mesh"}, True)):
-        links = load_robot("ur5-plane", **given).links
-        assert any(has_meshes(link.collisions) for link in links) is expected
+def test_collision_shapes_are_primitives():
+    assert not any(has_meshes(link.collisions) for link in load_robot("ur5-plane").links)
 
 
 def test_robot_files_are_read(tmp_path, monkeypatch):

@@ -656,12 +656,7 @@ def test_block_clearance_ignores_moving_links_and_the_tool_point_does_not():
     [
         (lambda: pushed().free([0.0]), r"needs \(n, 1\)"),
         (lambda: pushed(obstacles=(SLAB,)).free([[0.0, 0.0]]), r"needs \(n, 1\)"),
-        (lambda: pushed().free([[0.0]], block_at(0.5, 0.5)), r"shape \(7,\); 1 configurations"),
-        (lambda: pushed().free([[0.0]], [block_at(0.5, 0.5)] * 2), r"shape \(2, 7\)"),
-        (lambda: FreeSpace(Scene(aside())).free([[0.0]], [block_at(0.5, 0.5)]), "with a block"),
         (lambda: pushed().free([[np.nan]]), "q of lift is not finite"),
-        (lambda: pushed().free([[0.0]], [block_at(np.inf, 0.5)]), "pose of the block is not fin"),
-        (lambda: pushed().block_is_clear([block_at(np.nan, 0.5)]), "pose of the block is not fin"),
         (lambda: pushed().obstacle_hits([[np.inf]]), "q of lift is not finite"),
     ],
 )

@@ -29,11 +29,10 @@ from morphgen.tasks.actions import BINS
 from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.gym.env import TaskEnv
 from morphgen.tasks.gym.sb3 import SB3Vector
-from morphgen.tasks.gym.vector import TaskVector, observation_space, task_vector
+from morphgen.tasks.gym.vector import TaskVector, task_vector
 from morphgen.tasks.observation import ObservationConfig, observation_config
 from morphgen.tasks.sim.base import Contacts
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
-from morphgen.tasks.task import BOUND, ObservationField
 
 REACH, PUSH = "morphgen/Reach-v0", "morphgen/Push-v0"
 STEPS = 8
@@ -566,11 +565,3 @@ def test_making_vectors_shows_progress_and_closed_ones_raise_a_clear_error():
     for use in (envs.reset, lambda: envs.step(envs.action_space.sample())):
         with pytest.raises(TaskError, match="this environment is closed"):
             use()
-
-
-def test_spaces_have_the_bounds_declared_by_the_task():
-    values = {"speed": np.zeros((3, 2), np.float32), "goal": np.zeros((3, 7), np.float32)}
-    fields = (ObservationField("speed", 2, "speed_mask", low=0.0, high=5.0),)
-    space = observation_space(values, fields)
-    assert (space["speed"].low.min(), space["speed"].high.max()) == (0.0, 5.0)
-    assert (space["goal"].low.min(), space["goal"].high.max()) == (-BOUND, BOUND)
