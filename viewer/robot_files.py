@@ -28,8 +28,8 @@ from morphgen.formats.bundle import CARD, MJCF, split_colours, write_bundle
 from morphgen.formats.picture import render
 from morphgen.formats.zip_files import write_entries
 from morphgen.model.kinematics import joint_limits
+from morphgen.model.mesh_files import read_picture
 from morphgen.model.robot import Robot
-from morphgen.model.scene_files import read_picture
 from morphgen.typing import Array
 from morphgen.viewer.app.address import AddressError
 from morphgen.viewer.app.server import AccessPolicy, start_server, stop_server

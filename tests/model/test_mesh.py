@@ -19,9 +19,8 @@ from morphgen.errors import MeshError
 from morphgen.model import mesh_files
 from morphgen.model.geometry import Mesh, Shape
 from morphgen.model.mesh import convex_hull, load_mesh, mesh_parts
-from morphgen.model.mesh_files import read_mesh_file
+from morphgen.model.mesh_files import MAX_PIXELS, read_mesh_file
 from morphgen.model.robot import Link, Robot
-from morphgen.model.scene_files import MAX_PIXELS
 
 RED, BLUE = (1.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 1.0)
 

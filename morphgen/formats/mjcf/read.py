@@ -44,6 +44,7 @@ from morphgen.model.geometry import (
     Sphere,
 )
 from morphgen.model.mesh import load_mesh
+from morphgen.model.mesh_files import MAX_COORDINATE, MAX_FACES
 from morphgen.model.robot import (
     TOOL,
     Frame,
@@ -56,7 +57,6 @@ from morphgen.model.robot import (
     sorted_pair,
 )
 from morphgen.model.rotation import Vec3
-from morphgen.model.scene_files import MAX_COORDINATE, MAX_FACES
 from morphgen.model.tree import below, take_name
 from morphgen.typing import Array
 
