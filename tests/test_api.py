@@ -155,8 +155,8 @@ def test_splits_of_every_regime_are_those_of_the_command_line(tmp_path, monkeypa
          {"hold_out": "ee=plane", "robots": pattern, "train": 2}),
         (["interpolation", "--grammar", "arm3", "--hull", "inside", "--seed", "3"],
          {"regime": "interpolation", "grammar": "arm3", "hull": "inside", "seed": 3}),
-        (["composition", "--from", pattern, "--task", "push", "--obstacles"],
-         {"regime": "composition", "robots": pattern, "task": "push", "obstacles": True}),
+        (["--hold-out", "arm=lwr+ee=plane", "--from", pattern, "--task", "push", "--obstacles"],
+         {"hold_out": "arm=lwr+ee=plane", "robots": pattern, "task": "push", "obstacles": True}),
         (["extrapolation", "--train-category", "stick,nlink", "--test-category", "chain",
           "--train", "2,4", "--max-links", "25"],
          {"regime": "extrapolation", "train_category": ["stick", "nlink"], "train": [2, 4],
@@ -224,7 +224,7 @@ split() => no split is named; expected a name, or hold_out or regime
 split("a", test=2) => hold-out: hold_out is missing; valid: hold_out, ro
 split(hold_out="arm=lwrr") => no arm matches 'lwrr'; did you mean 'lwr'
 held_out(hull="any") => hold-out: no effect of hull; va
-split(regime="composed") => unknown regime 'composed'; did you mean 'com
+split(regime="extrapolate") => unknown regime 'extrapolate'; did you mean 'extra
 split(regime="interpolation", grammar=["arm3", "arm5"]) => 2 grammars
 held_out(task="reech") => unknown task 'reech'; did yo
 split("../a", hold_out="arm=lwr") => name '../a': use letters, digits

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, TypedDict, overload
 
 from morphgen.benchmark.generate import (
     SplitRequest,
-    composition,
     extrapolation,
     interpolation,
 )
@@ -42,7 +41,6 @@ from morphgen.model.robot import Robot
 from morphgen.progress import part_of
 from morphgen.splits.split import (
     HOLD_OUT,
-    REGIMES,
     Regime,
     Split,
     compose_side,
@@ -223,7 +221,7 @@ class LoadedSplit:
 
 
 Names = str | Sequence[str]  # one name, or several
-DEFAULT_TRAIN = 10  # number of train robots; a split of compositions has all that may be trained on
+DEFAULT_TRAIN = 10  # number of train robots
 
 
 class NewSplit(TypedDict, total=False):
@@ -294,17 +292,16 @@ def split(
         name: Name of a split that comes with morphgen, such as ``interpolation/arm3/reach``; a
             split's file; or the folder where a split was built. The name of a new split is by
             default made from the other arguments.
-        train: Number of train robots, by default 10; for compositions all that may be trained on.
-            Several numbers that grow give a split each, with the same test robots, the smaller
-            within the larger.
+        train: Number of train robots, by default 10. Several numbers that grow give a split each,
+            with the same test robots, the smaller within the larger.
         library: Folders of your own parts and grammars.
         **choice: Arguments of a new split. A name or rule may also be a list of several.
 
             - ``hold_out``: parts (``arm=kinova*``), a manufacturer (``manufacturer=Kinova``) or
               a combination (``arm=ur5+ee=plane``)
             - ``regime``: ``interpolation`` with ``grammar`` and ``hull`` (``inside``, ``outside``
-              or ``any``); ``composition`` with ``robots``; ``extrapolation`` with
-              ``train_category`` and ``test_category`` (grammars)
+              or ``any``); ``extrapolation`` with ``train_category`` and
+              ``test_category`` (grammars)
             - ``robots``: words of ``compose`` with choices in braces and wildcards, by default
               ``arm=* ee=*``; ``grammar``: grammars to draw from
             - ``test``: number of test robots, by default 1; ``task``: by default ``reach``;
@@ -343,7 +340,6 @@ def split(
 
 _RULES: Mapping[Regime, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "interpolation": (("grammar",), ("hull",)),
-    "composition": (("robots",), ()),
     "extrapolation": (("train_category", "test_category"), ()),
     "hold-out": (("hold_out",), ("robots", "grammar")),
 }
@@ -376,7 +372,7 @@ def _parse(
     if len(set(tasks)) < len(tasks) or not tasks:
         raise BenchmarkError(f"task {list(tasks)}: expected one or more, all different")
     if train is None:
-        train = () if regime == "composition" else DEFAULT_TRAIN
+        train = DEFAULT_TRAIN
     sizes = tuple(train) if isinstance(train, Iterable) else (train,)
     sizes = tuple(whole_number("split: train", size, BenchmarkError) for size in sizes)
     test, seed, max_links = (
@@ -392,8 +388,8 @@ def _parse(
 
 def _require_rules(regime: Regime, rules: Rules) -> None:
     """Require the rules that a regime needs, and no others."""
-    if regime not in REGIMES:
-        raise BenchmarkError(f"unknown regime {regime!r}{nearest(regime, REGIMES)}")
+    if regime not in _RULES:
+        raise BenchmarkError(f"unknown regime {regime!r}{nearest(regime, _RULES)}")
     required, optional = _RULES[regime]
     listed = ", ".join([*required, *optional])
     for key in required:
@@ -411,10 +407,6 @@ def _word(regime: Regime, rules: Rules) -> str:
     if regime == HOLD_OUT:
         words = re.findall(r"[A-Za-z0-9_.]+", ",".join(rules["hold_out"]))
         return "-".join(words)[:MAX_WORD].strip("-.")
-    if regime == "composition":
-        words = " ".join(rules["robots"]).split()
-        keys = dict.fromkeys(word.partition("=")[0] for word in words if "={" in word)
-        return "-".join(keys) or "robots"
     grammars = [Path(name).stem for name in rules.get("test_category") or rules["grammar"]]
     return "-".join([*grammars, *(hull for hull in rules.get("hull", ()) if hull != "any")])
 
@@ -427,12 +419,10 @@ def _choose(
         for key in ("grammar", "train_category", "test_category")
     )
     patterns = rules.get("robots", ())
-    with part_of(request.train[-1] + request.test if request.train else None):
+    with part_of(request.train[-1] + request.test):
         if regime == "interpolation":
             hull = ",".join(rules.get("hull", ("any",)))
             return interpolation(request, grammars[0], library, hull=hull, jobs=jobs)
-        if regime == "composition":
-            return composition(request, patterns, library, jobs=jobs)
         if regime == "extrapolation":
             return extrapolation(request, train, test, library, jobs=jobs)
         held_out = rules["hold_out"]

@@ -23,7 +23,6 @@ from morphgen.benchmark.generate import (
     SplitRequest,
     assemble,
     members,
-    require_size,
 )
 from morphgen.benchmark.regimes import NOTHING, found, parts, pattern_robots
 from morphgen.encoding.similarity import is_near
@@ -510,7 +509,6 @@ def hold_out(
     jobs: int = 1,
 ) -> tuple[Split, ...]:
     """Return splits whose test robots have held-out parts, and whose train robots have none."""
-    require_size(request)
     rules = parse_rules(hold_out, library)
     if request.test < len(rules):
         raise BenchmarkError(

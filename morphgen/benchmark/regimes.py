@@ -231,17 +231,6 @@ class RuledRobot:
         """See ``parts``."""
         return parts(self.derivation)
 
-    @property
-    def outermost(self) -> str:
-        """The last part of the robot, usually the end-effector."""
-        *_, last = (node.part for node in self.derivation.walk() if node.part != NOTHING)
-        return last
-
-    @cached_property
-    def covers(self) -> frozenset[str]:
-        """The parts and the task that training with this robot covers."""
-        return self.parts | {f"task {self.task}"}
-
     @cached_property
     def parameters(self) -> list[float]:
         """Values of ``parameters``."""

@@ -38,7 +38,6 @@ from morphgen.formats.files import require_writable_folder
 from morphgen.model.findings import Finding
 from morphgen.splits.split import (
     HOLD_OUT,
-    REGIMES,
     SIDES,
     Split,
     read_split,
@@ -228,18 +227,15 @@ def _stats_row(
 def new(args: argparse.Namespace) -> None:
     """Choose the robots, write the splits and print what they are."""
     if args.subcommand is None and not args.hold_out:
-        regimes = ", ".join(regime for regime in REGIMES if regime != HOLD_OUT)
         args.parser.error(
-            f"name what to hold out, such as --hold-out 'arm=kinova*', or a regime: {regimes}"
+            "name what to hold out, such as --hold-out 'arm=kinova*', or a regime: interpolation, "
+            "extrapolation"
         )
     choice = opt.given(args, NewSplit.__annotations__)
     choice["regime"] = args.subcommand or HOLD_OUT
-    train = args.train
-    if train is None:
-        train = () if choice["regime"] == "composition" else (DEFAULT_TRAIN,)
+    train = (DEFAULT_TRAIN,) if args.train is None else args.train
     # Smaller splits are parts of the largest.
-    total = train[-1] + args.test if train else None
-    with bar(args, "sampling", total=total):
+    with bar(args, "sampling", total=max(train, default=0) + args.test):
         loaded = open_split(args.name or "", train=train, library=args.library, **choice)
     splits = [each.definition for each in loaded]
     paths = split_paths(args.out, splits)

@@ -14,7 +14,7 @@ from morphgen.benchmark.hold_out import (
     parts_name,
     unique_names,
 )
-from morphgen.benchmark.regimes import pattern_robots
+from morphgen.benchmark.regimes import expand, pattern_robots
 from morphgen.benchmark.survey import audit
 from morphgen.errors import BenchmarkError, CompositionError, PartError
 from morphgen.grammar.request import parse_words
@@ -164,7 +164,7 @@ def test_nested_sizes_share_the_test_robots_and_train_all_their_parts():
         (["arm=ur5"], (4,), {}, "--test 1: no different robots with arm=ur5, whose other parts"),
         (["arm=ur5", "ee=plane"], (4,), {"test": 2}, "--hold-out arm=ur5: no robots with it, who"),
         (["ee=plane"], (1,), {"test": 2}, "--train 1: no train robot has "),
-        (["ee=plane"], (), {}, "--train: say how many robots to train on"),
+        (["ee=plane"], (), {}, "--train and --test start at 1"),
         ([], (4,), {}, "--hold-out: nothing is held out; expected such as arm=kinova*"),
     ],
 )
@@ -325,3 +325,27 @@ def test_robots_are_named_after_their_parts():
     assert parts_name(parse_derivation("base=fixed")) == "fixed"
     repeated = [f"slides+2xbead+claw-{number}" for number in (2, 3)]
     assert unique_names([chain, two, chain, chain])[2:] == repeated
+
+
+def test_braces_are_expanded():
+    assert expand("arm={ur5,lwr} ee=plane") == [("arm=ur5", "ee=plane"), ("arm=lwr", "ee=plane")]
+    assert expand(" arm={ ur5 , lwr }  ") == [("arm=ur5",), ("arm=lwr",)]
+    sizes = [words for (words,) in expand("ee.size={5,10}{cm,mm}")]
+    assert sizes == ["ee.size=5cm", "ee.size=5mm", "ee.size=10cm", "ee.size=10mm"]
+    assert expand("arm=ur5") == [("arm=ur5",)]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "message"),
+    [
+        ("arm={ur5,lwr ee=plane", "a brace is not closed, or opened twice"),
+        ("arm={ur5,{lwr}}", "a brace is not closed, or opened twice"),
+        ("arm={ur5,,lwr}", r"{ur5,,lwr} has an empty choice"),
+        ("arm={ur5,lwr,ur5}", "{ur5,lwr,ur5} has 'ur5' twice"),
+        (" ", "--from is empty"),
+    ],
+)
+def test_invalid_braces_are_errors(pattern, message):
+    with pytest.raises(BenchmarkError) as caught:
+        expand(pattern)
+    assert message in str(caught.value)
