@@ -12,8 +12,8 @@ from tabulate import tabulate
 
 from morphgen.grammar.library import default_library
 from morphgen.splits.split import read_split
-from morphgen.tasks.goals.split_goals import certify_goal_set
 from morphgen.tasks.scenes.env_specs import env_spec, member_with_primitives
+from morphgen.tasks.split_goals import certify_goal_set
 
 SPLITS = ("interpolation/panda/push", "extrapolation/arms/push", "interpolation/panda/reach")
 

@@ -24,10 +24,10 @@ from morphgen.grammar.library import Library, default_library
 from morphgen.processes import parallel_map
 from morphgen.progress import show_progress
 from morphgen.splits.split import Member, read_split, sided_members, split_names
-from morphgen.tasks.goals.goal_sets import FOLDER, INDEX, packaged_index, set_npz
-from morphgen.tasks.goals.split_goals import certify_goal_set
+from morphgen.tasks.goal_sets import FOLDER, INDEX, packaged_index, set_npz
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, member_with_primitives
+from morphgen.tasks.split_goals import certify_goal_set
 
 Identity = tuple[str, str, bool]
 """Hash of a robot in splits, its task, and whether there are obstacles."""

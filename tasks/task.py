@@ -339,8 +339,6 @@ class Task(ABC, Generic[C, G]):
     """Whether its scenes have an object."""
     target: str = "goal"
     """Noun for the thing that ``StepResult.distance`` is measured from."""
-    goal_files_readme: str = ""
-    """Lines of Markdown that explain the arrays of a stored goal set."""
 
     @abstractmethod
     def sample(

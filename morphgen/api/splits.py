@@ -50,14 +50,14 @@ from morphgen.splits.split import (
     write_new_splits,
 )
 from morphgen.tables import table
-from morphgen.tasks.goals.split_goals import (
+from morphgen.tasks.registry import TASKS
+from morphgen.tasks.scenes.env_specs import GoalConfig, load_robot
+from morphgen.tasks.split_goals import (
     GoalResult,
     goal_record,
     sample_robot_goals,
     sample_split_goals,
 )
-from morphgen.tasks.registry import TASKS
-from morphgen.tasks.scenes.env_specs import GoalConfig, load_robot
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

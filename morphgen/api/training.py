@@ -37,7 +37,6 @@ from morphgen.rl.runs.training import train as train_parts
 from morphgen.rl.shipped_policies import checkpoint_path
 from morphgen.splits.split import Side, read_split, require_side
 from morphgen.tasks.configs import ReachConfig
-from morphgen.tasks.goals.split_goals import has_goals, read_split_goals
 from morphgen.tasks.registry import (
     DEFAULT_SIMULATOR,
     SIMULATORS,
@@ -46,6 +45,7 @@ from morphgen.tasks.registry import (
     require_simulator_device,
 )
 from morphgen.tasks.scenes.env_specs import IN_EVERY_FILE, GoalConfig, load_robot
+from morphgen.tasks.split_goals import has_goals, read_split_goals
 from morphgen.tasks.task import TaskConfig
 
 

@@ -7,7 +7,7 @@ licences.json      every part with its licence and robots
 croissant.json     description of the dataset for tools (https://docs.mlcommons.org/croissant)
 scores.json        reference scores, if there are any
 submissions/       the reference submissions that the scores were computed from
-goals/             goal sets, see ``morphgen.tasks.goals.split_goals``
+goals/             goal sets, see ``morphgen.tasks.split_goals``
 
 An archive is a zip of this folder. The same inputs give the same bytes.
 """
@@ -69,7 +69,8 @@ from morphgen.splits.split import (
     sided_members,
     split_id,
 )
-from morphgen.tasks.goals.split_goals import (
+from morphgen.tasks.scenes.env_specs import GoalConfig, member_spec
+from morphgen.tasks.split_goals import (
     GOALS,
     GoalResult,
     SplitGoals,
@@ -80,7 +81,6 @@ from morphgen.tasks.goals.split_goals import (
     require_goal_sets,
     sample_split_goals,
 )
-from morphgen.tasks.scenes.env_specs import GoalConfig, member_spec
 
 RELEASE_FILE = "release.json"
 SCORES_FILE = "scores.json"

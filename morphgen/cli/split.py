@@ -47,9 +47,9 @@ from morphgen.splits.split import (
     write_new_splits,
 )
 from morphgen.tables import table
-from morphgen.tasks.goals.split_goals import GoalResult, sample_split_goals
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig
+from morphgen.tasks.split_goals import GoalResult, sample_split_goals
 
 
 def goals(args: argparse.Namespace) -> int:

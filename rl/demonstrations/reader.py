@@ -32,7 +32,7 @@ from morphgen.rl.demonstrations.lerobot import (
 )
 from morphgen.tasks.actions import ActionKind, encode_actions
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.goals.goal_sets import goals_from_npz
+from morphgen.tasks.goal_sets import goals_from_npz
 from morphgen.tasks.observation import Observation, ObservationConfig
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import ground_under, load_robot, task_configs

@@ -65,12 +65,12 @@ from morphgen.rl.runs.robot_source import (
 from morphgen.splits.split import Member, compose_member
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.goals.goal_sets import set_npz
-from morphgen.tasks.goals.split_goals import certify_goal_set, read_goals, shipped_goal_set
+from morphgen.tasks.goal_sets import set_npz
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.renderer import Camera
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot
 from morphgen.tasks.scenes.make import batch_from_specs
+from morphgen.tasks.split_goals import certify_goal_set, read_goals, shipped_goal_set
 from morphgen.tasks.task import EnvSpec
 
 PLANNER = "scripted"

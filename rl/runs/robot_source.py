@@ -49,9 +49,9 @@ from morphgen.splits.split import (
     split_names,
     split_text,
 )
-from morphgen.tasks.goals.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot, member_spec
+from morphgen.tasks.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.task import EnvSpec
 
 

@@ -48,10 +48,6 @@ class Articulated(ObjectTask[ArticulatedConfig, ArticulatedStartSet]):
     goal_set_type = ArticulatedStartSet
     goal_format = 1
     fields = (OBJECT, BASE, JOINT)
-    goal_files_readme = """\
-- drawer, door, dial: `q` (n, dof) are starts; the object's `urdf` stands at `place` (7,), and its
-  joint has to move from `start` (n,) to `goal` (n,)
-"""
 
     def __init__(self, config_type: type[ArticulatedConfig]) -> None:
         """Make the task of a type of constants, which names it and its object."""

@@ -45,10 +45,6 @@ class Push(ObjectTask[PushConfig, PushStartSet]):
     cache_folder = "pushes-4"
     fields = (OBJECT, LINE)
     target = "line"
-    goal_files_readme = """\
-- push: `q` (n, dof) are starts, and `blocks` (n, 7) poses of the block, whose centre must cross
-  y = `line`
-"""
 
     def key_parts(self, config: PushConfig) -> list[object]:
         """Return the number of starts, and the constants that they depend on."""

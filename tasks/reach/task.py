@@ -98,10 +98,6 @@ class Reach(Task[ReachConfig, ReachGoalSet]):
     cache_folder = "goals-5"
     fields = (GOAL,)
     discrete_actions = True
-    goal_files_readme = """\
-- reach: `q` (n, dof) are configurations free of collisions without obstacles, and `poses` (n, 7) of
-  the tool at them are the goals; `q` are the starts of episodes, too
-"""
 
     def check(self, robot: Robot, config: ReachConfig) -> None:
         """Refuse a robot whose tool does not move."""

@@ -19,7 +19,7 @@ from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Robot
 from morphgen.splits.split import Member, compose_member
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.goals.goal_sets import goal_set
+from morphgen.tasks.goal_sets import goal_set
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import Scene
 from morphgen.tasks.task import EnvSpec, GoalSet, TaskConfig

@@ -20,7 +20,6 @@ from morphgen.progress import own_progress, show_progress
 from morphgen.splits.split import Side, Split
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.goals.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.observation import ObservationConfig
 from morphgen.tasks.random_numbers import require_seed
 from morphgen.tasks.registry import (
@@ -33,6 +32,7 @@ from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, load_robot, me
 from morphgen.tasks.scenes.obstacles import LayoutSide
 from morphgen.tasks.scenes.robot_tables import build_robot_tables
 from morphgen.tasks.sim.base import Contacts, Simulator
+from morphgen.tasks.split_goals import read_goals, shipped_goal_set
 from morphgen.tasks.task import EnvSpec, TaskConfig
 
 if TYPE_CHECKING:

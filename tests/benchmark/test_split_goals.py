@@ -23,9 +23,9 @@ from morphgen.grammar.library import default_library
 from morphgen.progress import show_progress
 from morphgen.splits.split import read_split, split_names
 from morphgen.tasks import free_space
+from morphgen.tasks import goal_sets as packaged_sets
 from morphgen.tasks.configs import PushConfig, ReachConfig
-from morphgen.tasks.goals import goal_sets as packaged_sets
-from morphgen.tasks.goals.goal_sets import (
+from morphgen.tasks.goal_sets import (
     FOLDER,
     INDEX,
     arrays_of,
@@ -35,13 +35,6 @@ from morphgen.tasks.goals.goal_sets import (
     packaged_set,
     set_npz,
 )
-from morphgen.tasks.goals.split_goals import (
-    certify_goal_set,
-    read_goals,
-    read_split_goals,
-    sample_robot_goals,
-)
-from morphgen.tasks.goals.split_goals import sample_split_goals as make
 from morphgen.tasks.reach import task as reach_goals
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import (
@@ -51,6 +44,13 @@ from morphgen.tasks.scenes.env_specs import (
     member_with_primitives,
 )
 from morphgen.tasks.scenes.make import make_split_batch
+from morphgen.tasks.split_goals import (
+    certify_goal_set,
+    read_goals,
+    read_split_goals,
+    sample_robot_goals,
+)
+from morphgen.tasks.split_goals import sample_split_goals as make
 
 RECIPE = GoalConfig(0, (ReachConfig(num_goals=12), PushConfig(num_goals=4)))
 
@@ -224,7 +224,7 @@ def test_builds_are_byte_identical(home, tmp_path):
     write_goals(home, sample_sets(mixed(), tmp_path / "cache0"), RECIPE)
     assert tree(home) == tree(other)
     names = sorted(path.name for path in (home / "goals").iterdir())
-    assert names == ["README.md", "index.json", "test", "train"]
+    assert names == ["index.json", "test", "train"]
 
 
 def test_batch_uses_stored_sets_and_rejects_others(home, cache, monkeypatch):

@@ -82,7 +82,7 @@ def own_cache(cache, monkeypatch):
 @pytest.fixture
 def goal_cache(tmp_path, monkeypatch):
     """A temporary goal cache; fits use the user's cache."""
-    from morphgen.tasks.goals import goal_sets  # loads torch, which few of the tests need
+    from morphgen.tasks import goal_sets  # loads torch, which few of the tests need
 
     monkeypatch.setattr(goal_sets, "user_cache_path", lambda name: tmp_path / "cache" / name)
     return tmp_path / "cache" / "morphgen"

@@ -12,7 +12,7 @@ from helpers.splits import TEST, TRAIN, combined, member
 from morphgen.benchmark.split_folder import load_split_folder
 from morphgen.benchmark.survey import paper_rows
 from morphgen.splits.split import read_split, split_id, split_names, split_text
-from morphgen.tasks.goals.split_goals import read_goals
+from morphgen.tasks.split_goals import read_goals
 
 INTERPOLATION = ("split", "new", "interpolation", "--grammar", "cubes", "--train", "3")
 EXTRAPOLATION = ("split", "new", "extrapolation", "--train-category", "stick,nlink,prims")

@@ -19,8 +19,8 @@ from morphgen.rl.runs.robot_source import FILE, fresh_source, members, read_draw
 from morphgen.rl.runs.training import METRICS, _StopRequest, read_metrics
 from morphgen.rl.shipped_policies import POLICIES, ShippedPolicy, policies_for
 from morphgen.splits.split import Member, write_split
-from morphgen.tasks.goals.split_goals import read_goals
 from morphgen.tasks.scenes.env_specs import GoalConfig
+from morphgen.tasks.split_goals import read_goals
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 

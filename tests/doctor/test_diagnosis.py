@@ -40,8 +40,8 @@ from morphgen.rl.runs.robot_source import split_source
 from morphgen.rl.shipped_policies import POLICIES
 from morphgen.splits import split
 from morphgen.splits.split import read_split, split_id, split_names
-from morphgen.tasks.goals import split_goals
-from morphgen.tasks.goals.goal_sets import FOLDER, INDEX
+from morphgen.tasks import split_goals
+from morphgen.tasks.goal_sets import FOLDER, INDEX
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP
 

@@ -1,7 +1,7 @@
 """Goal sets and environment specifications of a robot, and functions called once."""
 
 from morphgen.tasks.configs import ReachConfig
-from morphgen.tasks.goals.goal_sets import goal_set
+from morphgen.tasks.goal_sets import goal_set
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec
 

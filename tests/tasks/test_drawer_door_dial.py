@@ -17,7 +17,7 @@ from morphgen.tasks.articulated.envs import GAP, ArticulatedFormulas, object_tab
 from morphgen.tasks.articulated.starts import PathFinder
 from morphgen.tasks.configs import DialConfig, DoorConfig, DrawerConfig, PushConfig, ReachConfig
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.goals.goal_sets import set_from_npz, set_npz
+from morphgen.tasks.goal_sets import set_from_npz, set_npz
 from morphgen.tasks.observation import NOISE, ObservationConfig
 from morphgen.tasks.registry import SIMULATORS, TASKS
 from morphgen.tasks.scenes.make import make_batch

@@ -24,10 +24,10 @@ from morphgen.model.kinematics import (
 from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.model.tree import rename
 from morphgen.tasks import free_space as of_free_space
+from morphgen.tasks import goal_sets
 from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.free_space import SAME, FreeSpace, cspace_components, in_other_component
-from morphgen.tasks.goals import goal_sets
-from morphgen.tasks.goals.goal_sets import set_npz
+from morphgen.tasks.goal_sets import set_npz
 from morphgen.tasks.push import starts
 from morphgen.tasks.push.starts import push_region
 from morphgen.tasks.reach import task as module

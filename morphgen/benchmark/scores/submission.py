@@ -46,7 +46,7 @@ from morphgen.processes import parallel_map
 from morphgen.progress import note
 from morphgen.rl.scores import LISTS, Count, Name, RobotOutcomes, Score
 from morphgen.splits.split import Member, Side, Split, sided_members, split_id
-from morphgen.tasks.goals.goal_sets import goal_set_key
+from morphgen.tasks.goal_sets import goal_set_key
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
 from morphgen.tasks.scenes.env_specs import (
     GoalConfig,

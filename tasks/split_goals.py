@@ -2,7 +2,6 @@
 
 goals/index.json             seed and constants of all sets, and a record of each set
 goals/<side>/<name>.npz      fields of a goal set; the task determines its class
-goals/README.md              explanation of these files
 
 A set depends on robot, task, constants, obstacles and seed, but not on the split, the side or the
 other robots, so that single- and multi-embodiment training have the same goals.
@@ -25,7 +24,7 @@ from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map
 from morphgen.splits.split import Member, Side, Split, require_side, sided_members
-from morphgen.tasks.goals.goal_sets import goals_from_npz, set_npz
+from morphgen.tasks.goal_sets import goals_from_npz, set_npz
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import (
     GoalConfig,
@@ -38,28 +37,6 @@ from morphgen.tasks.task import EnvSpec, GoalSet
 GOALS = "goals"  # name of the folder of goal sets in a built split
 INDEX = "index.json"
 FORMAT = 2
-
-_README = """\
-# Goal sets
-
-`{index}` says how the sets were made (seed and constants of the tasks) and lists them: robot, side,
-task, obstacles, hash of the body with fitted primitives as its collision shapes, key (a hash of all
-that the set follows from), seed, number of goals, configurations tried and accepted, SHA-256 of the
-file.
-
-{tasks}- `obstacles` (m, 12) and `block` (12,): edges, pose, mass and friction of boxes
-- `layouts` (L, m, 7): poses of the obstacles in each layout, those for training first, and `usable`
-  (L, n): which goals or starts a layout leaves possible
-
-Poses are x, y, z, qw, qx, qy, qz in the world, whose origin is the robot's root; metres and rad.
-
-```python
-from morphgen.tasks.goals.split_goals import read_goals
-
-for name, goals in read_goals("..", "test").items():
-    print(name, goals.q.shape)
-```
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,8 +228,6 @@ def goal_files(results: Sequence[GoalResult], config: GoalConfig) -> Iterator[tu
     head_text = json.dumps(constants, indent=2).removesuffix("\n}")
     lines = ",\n".join(f"    {json.dumps(record)}" for record in records)
     yield INDEX, f'{head_text},\n  "sets": [\n{lines}\n  ]\n}}\n'.encode()
-    arrays = "".join(dict.fromkeys(TASKS[name].goal_files_readme for name in tasks))
-    yield "README.md", _README.format(index=INDEX, tasks=arrays).encode()
 
 
 def goal_record(result: GoalResult) -> dict[str, object]:

@@ -30,7 +30,7 @@ from morphgen.tasks.registry import TASKS
 from morphgen.tasks.sim.base import Block
 from morphgen.tasks.task import BOUND, GoalSet, Task, TaskConfig, require_returned
 
-FOLDER = Path(__file__).parents[1] / "goal_set_files"
+FOLDER = Path(__file__).parent / "goal_set_files"
 """Folder of the compressed sets and of their index."""
 INDEX = "index.json"
 MAX_REFUSAL = 2000  # characters that are read of why a robot has no goals

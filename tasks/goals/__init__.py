@@ -1,1 +1,0 @@
-"""Goal sets: sampling, audits and the goals of splits."""
