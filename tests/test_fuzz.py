@@ -195,7 +195,7 @@ def test_mjcf_bytes(runner, data, command):
 
 @pytest.mark.slow
 @manners(200)
-@given(text=grammars, command=st.sampled_from(["check", "count", "enumerate", "print"]))
+@given(text=grammars, command=st.sampled_from(["check", "count", "print"]))
 def test_grammar_text(runner, text, command):
     path = runner.folder / "some.grammar"
     path.write_text(text, encoding="utf-8")

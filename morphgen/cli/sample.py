@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import itertools
-import json
 import math
 from collections import Counter
 from dataclasses import asdict
@@ -12,7 +10,6 @@ from pathlib import Path
 
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar
-from morphgen.grammar import analysis
 from morphgen.grammar.analysis import check_grammar, count_structures, load_sound_grammar, variables
 from morphgen.grammar.grammar_file import (
     Grammar,
@@ -63,19 +60,6 @@ def count(args: argparse.Namespace) -> None:
         return "\n".join(lines)
 
     opt.print_result(args, data, text)
-
-
-def enumerate_structures(args: argparse.Namespace) -> None:
-    """Print a derivation per line."""
-    library = opt.library_of(args)
-    grammar = load_sound_grammar(args.grammar, library)
-    structures = analysis.enumerate_structures(grammar, library)
-    texts = map(str, itertools.islice(structures, args.limit))
-    if args.json:
-        print(json.dumps(list(texts)))
-        return
-    for text in texts:
-        print(text)
 
 
 def print_grammar(args: argparse.Namespace) -> None:

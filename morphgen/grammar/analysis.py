@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 from itertools import islice
 
@@ -12,12 +12,7 @@ from morphgen.errors import CompositionError, GrammarError
 from morphgen.grammar import values
 from morphgen.grammar.compose import require_root
 from morphgen.grammar.derive import (
-    Chooser,
-    DeriveCache,
-    TooManyPartsError,
     argument,
-    count_fewest_parts,
-    derive,
     free_port,
     production_weights,
     require_no_arguments,
@@ -32,17 +27,11 @@ from morphgen.grammar.syntax import (
     MAX_COUNT,
     MAX_FAULTS,
     MAX_PARTS,
-    MAX_SEARCH,
     Alternative,
-    Derivation,
     Item,
 )
 
 _MANY = MAX_COUNT + 1  # stands for any larger number of structures
-
-
-class SearchError(GrammarError):
-    """The search for another structure was given up after ``MAX_SEARCH`` parts."""
 
 
 def count_structures(grammar: Grammar) -> float:
@@ -60,30 +49,6 @@ def count_structures(grammar: Grammar) -> float:
     return counts[grammar.start]
 
 
-def enumerate_structures(grammar: Grammar, library: Library) -> Iterator[Derivation]:
-    """Yield every structure once, with typical values; the smallest first if they are infinite."""
-    digests: set[str] = set()
-    is_infinite = count_structures(grammar) == math.inf
-    wasted_parts = 0
-    # Infinitely many structures are enumerated by size, a pass for each number of parts.
-    for max_parts in range(1, MAX_PARTS + 1) if is_infinite else (MAX_PARTS,):
-        for derivation in _derivations(grammar, library, max_parts):
-            size = max_parts if derivation is None else sum(1 for _ in derivation.walk())
-            fits = not is_infinite or size == max_parts
-            if derivation is not None and fits and derivation.digest not in digests:
-                digests.add(derivation.digest)
-                wasted_parts = 0
-                yield derivation
-                continue
-            wasted_parts += size
-            if wasted_parts > MAX_SEARCH:
-                raise SearchError(
-                    f"{grammar.name}: no new structure in the last {wasted_parts:,} parts "
-                    f"(limit {MAX_SEARCH:,}): alternatives repeat, or lead to more than "
-                    f"{MAX_PARTS} parts or levels"
-                )
-
-
 def _typical_scope(grammar: Grammar) -> values.Scope:
     """Return a scope with typical values of all names and distributions."""
     return values.Scope(_let_values(grammar, values.typical_value), values.typical_value, "")
@@ -97,56 +62,26 @@ def _let_values(grammar: Grammar, draw: values.Draw) -> dict[str, tuple[float, s
     return names
 
 
-@dataclass
-class _ScriptedChooser(Chooser):
-    """Follows a list of decisions, then chooses the first option; records the option counts."""
-
-    decisions: list[int]
-    options: list[int] = field(default_factory=list)  # number of options of every decision
-
-    def alternative(self, key: str, weights: list[float]) -> int:
-        possible = [i for i, weight in enumerate(weights) if weight > 0]
-        return possible[self._decide(len(possible))]
-
-    def count(self, key: str, low: int, high: int) -> int:
-        return low + self._decide(high - low + 1)
-
-    def _decide(self, options: int) -> int:
-        position = len(self.options)
-        self.options.append(options)
-        return self.decisions[position] if position < len(self.decisions) else 0
-
-
-def _derivations(grammar: Grammar, library: Library, max_parts: int) -> Iterator[Derivation | None]:
-    """Yield the derivation of every list of decisions; None if it has too many parts."""
-    decisions: list[int] = []
-    cache = DeriveCache(fewest_parts=_fewest_parts(_possible_alternatives(grammar)))
-    while True:
-        chooser = _ScriptedChooser(decisions)
-        try:
-            derivation = derive(grammar, library, chooser, max_parts, cache)
-        except TooManyPartsError:
-            derivation = None
-        yield derivation
-        # Advance the decisions like an odometer whose last digit turns fastest.
-        decisions = (decisions + [0] * len(chooser.options))[: len(chooser.options)]
-        while decisions and decisions[-1] + 1 >= chooser.options[len(decisions) - 1]:
-            decisions.pop()
-        if not decisions:
-            return
-        decisions[-1] += 1
-
-
-def _fewest_parts(possible: Mapping[str, Sequence[Alternative]]) -> dict[str, int]:
-    """Return the smallest number of parts of each symbol, at most ``MAX_PARTS + 1``."""
-    fewest = dict.fromkeys(possible, MAX_PARTS + 1)
-    before: dict[str, int] = {}
+def _is_too_large(start: str, possible: Mapping[str, Sequence[Alternative]]) -> bool:
+    """Return whether all robots of a symbol have too many parts, or are nested too deeply."""
+    most = MAX_PARTS + 2  # stands for any larger number
+    fewest = dict.fromkeys(possible, (most, most))  # parts and levels of each symbol
+    before: dict[str, tuple[int, int]] = {}
     while fewest != before:  # fixed-point iteration, as symbols may be recursive
         before = dict(fewest)
-        for symbol, alternatives in possible.items():
-            sizes = (count_fewest_parts(alternative, fewest) for alternative in alternatives)
-            fewest[symbol] = min((fewest[symbol], *sizes))
-    return fewest
+        for symbol in reversed([*possible]):  # most are defined after their use
+            parts, levels = [most], [most]
+            for alternative in possible[symbol]:
+                sizes = [
+                    ((item.repetition or (1, 1))[0] * n, depth + 1)
+                    for item in alternative.items
+                    for n, depth in [fewest.get(item.name, (1, 0))]
+                ]
+                parts.append(sum(n for n, _ in sizes))
+                levels.append(max(depth for _, depth in sizes))
+            fewest[symbol] = (min(parts), min(levels))
+    num_parts, num_levels = fewest[start]
+    return num_parts > MAX_PARTS or num_levels > MAX_PARTS + 1  # parts are a level of their own
 
 
 def _symbol_graph(
@@ -355,10 +290,10 @@ def _structure_faults(grammar: Grammar, library: Library) -> Iterator[str]:
             if item.name not in roots:
                 roots.add(item.name)
                 require_root(load_part(manifest, values))
-        if next(enumerate_structures(grammar, library), None) is None:
+        if _is_too_large(grammar.start, alternatives):
             limits = f"{MAX_PARTS} parts and {MAX_PARTS} levels"
             yield f"{location}: found no structure of at most {limits}"
-    except (CompositionError, SearchError) as error:
+    except CompositionError as error:
         yield f"{location}: {error}"
     except GrammarError as error:
         yield str(error)

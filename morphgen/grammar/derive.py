@@ -90,31 +90,13 @@ class _Node:
         return Derivation(self.label, self.part, tuple(self.values.items()), children)
 
 
-@dataclass(frozen=True)
-class DeriveCache:
-    """Facts shared by derivations of one grammar with the same values of ``let``."""
-
-    weights: dict[str, list[float]] = field(default_factory=dict)
-    """Weights of the alternatives by symbol; filled during derivations."""
-    fewest_parts: Mapping[str, int] = field(default_factory=dict)
-    """Smallest number of parts of each symbol; with it a derivation that will exceed the limit
-    stops as early as possible."""
-
-
 class TooManyPartsError(GrammarError):
     """A derivation has more parts than allowed."""
 
 
-def derive(
-    grammar: Grammar,
-    library: Library,
-    chooser: Chooser,
-    max_parts: int = MAX_PARTS,
-    cache: DeriveCache | None = None,
-) -> Derivation:
+def derive(grammar: Grammar, library: Library, chooser: Chooser) -> Derivation:
     """Rewrite the start symbol of a grammar until only parts are left."""
-    run = _Run(grammar, library, chooser, max_parts, cache or DeriveCache())
-    return run.root().derivation()
+    return _Run(grammar, library, chooser).root().derivation()
 
 
 @dataclass
@@ -128,14 +110,12 @@ class _Run:
     _grammar: Grammar
     _library: Library
     _chooser: Chooser
-    _max_parts: int
-    _cache: DeriveCache
     _labels: set[str] = field(default_factory=set)
     _names: dict[str, tuple[float, str]] = field(default_factory=dict)  # values of ``let``
+    _weights: dict[str, list[float]] = field(default_factory=dict)
+    """Weights of the alternatives by symbol."""
 
     def __post_init__(self) -> None:
-        self._pending = self._cache.fewest_parts.get(self._grammar.start, 0)
-        """Smallest number of parts that are still to be added."""
         for let in self._grammar.lets:
             scope = Scope(self._names, self._chooser.value, f"let {let.name}")
             self._names[let.name] = evaluate(let.expression, _with_unique_keys(scope))
@@ -193,33 +173,17 @@ class _Run:
             return [(prefix + item.name, prefix, key)]
         low, high = item.repetition
         n = low if low == high else self._chooser.count(f"{key}#", low, high)
-        if fewest := self._cache.fewest_parts:
-            self._add_pending((n - low) * fewest.get(item.name, 1), item)
         names = [f"{prefix}{item.name}{i}" for i in range(1, n + 1)]
         return [(name, f"{name}_", f"{key}[{i}]") for i, name in enumerate(names, start=1)]
 
     def _alternative(self, production: Production, key: str) -> Alternative:
-        weights = self._cache.weights.get(production.symbol)
-        if weights is None:
+        if production.symbol not in self._weights:
             scope = Scope(self._names, typical_value, key)
-            weights = self._cache.weights[production.symbol] = production_weights(production, scope)
-        index = self._chooser.alternative(key, weights) if len(weights) > 1 else 0
-        alternative = production.alternatives[index]
-        if fewest := self._cache.fewest_parts:
-            more = count_fewest_parts(alternative, fewest) - fewest[production.symbol]
-            self._add_pending(more, production)
-        return alternative
-
-    def _add_pending(self, more: int, where: Item | Production) -> None:
-        """Count parts that are still to be added; stop if they exceed the limit."""
-        self._pending += more
-        self._require_size(len(self._labels) + self._pending, where)
-
-    def _require_size(self, parts: int, where: Item | Production) -> None:
-        if parts > self._max_parts:
-            raise TooManyPartsError(
-                f"{where.location}: more than {self._max_parts} parts: does it end?"
-            )
+            self._weights[production.symbol] = production_weights(production, scope)
+        weights = self._weights[production.symbol]
+        return production.alternatives[
+            self._chooser.alternative(key, weights) if len(weights) > 1 else 0
+        ]
 
     def _part(self, item: Item, label: str, key: str) -> _Node:
         manifest = require_part(item, self._grammar, self._library)
@@ -231,8 +195,8 @@ class _Run:
         if values[MOUNT_YAW] == 0.0:
             del values[MOUNT_YAW]  # derivations from before the parameter existed stay equal
         node = _Node(take_name(label, self._labels), item.name, values, tuple(manifest.ports))
-        self._pending -= 1
-        self._require_size(len(self._labels), item)
+        if len(self._labels) > MAX_PARTS:
+            raise TooManyPartsError(f"{item.location}: more than {MAX_PARTS} parts: does it end?")
         return node
 
 
@@ -250,13 +214,6 @@ def production_weights(production: Production, scope: Scope) -> list[float]:
     if total <= 0:
         raise GrammarError(f"{production.location}: all weights of {symbol} are zero")
     return weights
-
-
-def count_fewest_parts(alternative: Alternative, fewest: Mapping[str, int]) -> int:
-    """Return the smallest number of parts of an alternative, given that of each symbol."""
-    return sum(
-        (item.repetition or (1, 1))[0] * fewest.get(item.name, 1) for item in alternative.items
-    )
 
 
 def require_no_arguments(symbol: Item) -> None:

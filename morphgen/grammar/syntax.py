@@ -34,8 +34,6 @@ MAX_NESTING = 100  # largest depth of an expression; `1 + 1 + 1` has three level
 MAX_FAULTS = 20  # largest number of faults that `morphgen grammar check` reports at once
 COUNT_DIGITS = 100  # exponent of `MAX_COUNT`
 MAX_COUNT: int = 10**COUNT_DIGITS  # largest number of structures that is counted exactly
-MAX_SEARCH = 20_000
-"""Number of parts without a new structure after which an enumeration is given up."""
 MAX_DERIVATION_TEXT = 256 * 1024  # largest length of a derivation's text [characters]
 
 

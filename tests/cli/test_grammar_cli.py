@@ -127,15 +127,6 @@ def test_counts_without_a_number_are_named(run, mine):
     mine.write_text("robot -> slides tail\ntail -> bead | bead tail\n")
     assert run("grammar", "count", mine)[1].startswith("mine: infinitely many structures")
     assert json.loads(run("grammar", "count", mine, "--json")[1])["structures"] is None
-    assert len(run("grammar", "enumerate", mine, "--limit", 4)[1].splitlines()) == 4
-
-
-def test_grammar_enumerate_prints_derivations_that_compose(ok, mine):
-    out = ok("grammar", "enumerate", mine)
-    ends = ["plane(size=0.1, thickness=0.01)]", "cube(size=0.1)]"]
-    assert [line.split("ee=")[1] for line in out.splitlines()] == ends
-    first = json.loads(ok("grammar", "enumerate", mine, "--limit", 1, "--json"))
-    assert first == out.splitlines()[:1]
 
 
 def test_grammar_print_is_a_grammar_without_includes(run, ok, mine):

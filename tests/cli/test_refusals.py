@@ -383,7 +383,6 @@ def test_commands_refuse_the_grammars_that_check_refuses(text, run, refused):
     fault = out.splitlines()[0]
     for command in (
         ["grammar", "count", "mine.grammar"],
-        ["grammar", "enumerate", "mine.grammar"],
         ["sample", "mine.grammar", "-n", 1, "--out", "out"],
         ["compose", "mine.grammar"],
         ["split", "new", "interpolation", "--grammar", "mine.grammar", "--out", "s.yaml"],
