@@ -33,6 +33,7 @@ from tqdm import tqdm
 
 from morphgen.api.checks import conform
 from morphgen.checks.conformance import MAX_DRIFT
+from morphgen.checks.rules import home_penetrations
 from morphgen.formats.bundle import MJCF, write_bundle
 from morphgen.formats.files import write_file
 from morphgen.grammar.compose import compose
@@ -161,7 +162,8 @@ def _measure(item: Item, library: Library, args: argparse.Namespace) -> Row:
             for name, column in SIMULATORS.items()
         },
         penetrations="; ".join(
-            f"{pair} {1000 * depth:.2g} mm" for pair, depth in report.penetrations.items()
+            f"{a}, {b} {1000 * depth:.2g} mm"
+            for (a, b), depth in sorted(home_penetrations(robot).items())
         ),
         doctor=doctor,
     )

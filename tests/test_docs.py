@@ -58,21 +58,20 @@ _DESCRIPTION = f"""<robot name="z1_description">{_LINK.format("link00")}{_LINK.f
 
 def add_outside_robots(folder, monkeypatch):
     """Write the robots below a folder, and let the collections find them there."""
-    menagerie, packages = folder / "outside" / "menagerie", folder / "outside" / "packages"
-    monkeypatch.setenv("MENAGERIE_ROOT", str(menagerie))
+    packages = folder / "outside" / "packages"
+    collection = packages / "robot_descriptions"
     lengths = {
-        menagerie / "universal_robots_ur5e" / "ur5e.xml": 0.3,
-        menagerie / "franka_emika_panda" / "panda_nohand.xml": 0.4,
+        collection / "ur5e.xml": 0.3,
         **{folder / "bodies" / f"body_{i}.xml": 0.2 + 0.02 * i for i in range(1, 23)},
     }
     for path, length in lengths.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(_MJCF.format(name=path.stem, length=length))
-    collection = packages / "robot_descriptions"
-    collection.mkdir(parents=True)
     (collection / "z1.urdf").write_text(_DESCRIPTION)
     (collection / "__init__.py").touch()
     (collection / "z1_description.py").write_text(f"URDF_PATH = {str(collection / 'z1.urdf')!r}\n")
+    mjcf = f"MJCF_PATH = {str(collection / 'ur5e.xml')!r}\n"
+    (collection / "ur5e_mj_description.py").write_text(mjcf)
     monkeypatch.syspath_prepend(str(packages))
 
 

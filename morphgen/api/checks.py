@@ -9,7 +9,6 @@ from tempfile import TemporaryDirectory
 from morphgen import checks
 from morphgen.checks.conformance import ConformanceReport, compare, compare_file, hold_files
 from morphgen.checks.readers import loader_copy
-from morphgen.checks.rules import home_penetrations
 from morphgen.formats.bundle import CARD, bundle_folder, file_findings, read_bundle, write_bundle
 from morphgen.formats.resolve import default_finder
 from morphgen.formats.urdf.read import UnsoundError
@@ -114,8 +113,8 @@ def conform(
         True
         >>> report.rows[2].loader, report.rows[2].position_error < 1e-5
         ('mujoco (urdf)', True)
-        >>> report.holds[0].simulator, report.holds[0].drift < 0.02, dict(report.penetrations)
-        ('mujoco (mjcf)', True, {})
+        >>> report.holds[0].simulator, report.holds[0].drift < 0.02
+        ('mujoco (mjcf)', True)
 
     Args:
         robot: The robot, its bundle's folder, a description, or words of ``compose``. The files
@@ -168,11 +167,5 @@ def _conform_bundle(bundle: Path, samples: int, seed: int) -> ConformanceReport:
     with loader_copy(bundle) as folder:
         report = compare(robot, folder, samples, seed)
         holds = hold_files(robot, folder)
-    return replace(
-        report,
-        passed=report.passed and all(row.passed is not False for row in holds),
-        holds=holds,
-        penetrations={
-            ", ".join(pair): depth for pair, depth in sorted(home_penetrations(robot).items())
-        },
-    )
+    passed = report.passed and all(row.passed is not False for row in holds)
+    return replace(report, passed=passed, holds=holds)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
@@ -124,9 +124,6 @@ class ConformanceReport:
     rows: tuple[ConformanceRow, ...]  # the loaders
     holds: tuple[HoldRow, ...] = ()
     """The simulators in which the robot holds its home configuration."""
-    penetrations: Mapping[str, float] = field(default_factory=dict)
-    """Depth of every pair of links, as ``a, b``, that penetrate at home [m]; ignored pairs are not
-    tested."""
 
 
 def conformance(bundle_dir: Path, samples: int = 100, seed: int = 0) -> ConformanceReport:

@@ -104,7 +104,7 @@ def _text(label: str, findings: Sequence[Finding], repaired: Sequence[Finding]) 
 
 
 def conform(args: argparse.Namespace) -> int:
-    """Print a row per robot and loader, one per simulator, and the pairs that penetrate at home."""
+    """Print a row per robot and loader, and one per simulator."""
     reports, refused = opt.for_each_robot(
         args,
         "loading",
@@ -165,13 +165,6 @@ def _conformance_text(reports: Mapping[str, ConformanceReport]) -> str:
         lines = [list(row.values()) for row in rows]
         text = table(lines, ("robot", *columns), style="plain", last=("joint",)) if rows else ""
         sections += [text, "\n".join(notes)]
-    sections.append(
-        "\n".join(
-            f"{Path(label).name}: at home, links {pair} penetrate by {1000 * depth:.3g} mm"
-            for label, report in reports.items()
-            for pair, depth in report.penetrations.items()
-        )
-    )
     return "\n\n".join(filter(None, sections))
 
 

@@ -14,7 +14,7 @@ from morphgen.cli.progress import bar, status
 from morphgen.errors import CompositionError, FormatError
 from morphgen.formats.bundle import CARD, URDF, bundle_folder, write_bundle
 from morphgen.formats.data_files import read_json
-from morphgen.formats.description import NamedDescription, find_description
+from morphgen.formats.description import find_description
 from morphgen.grammar.compose import compose as compose_parts
 from morphgen.grammar.part import part_manifest, write_part
 from morphgen.grammar.request import parse_words
@@ -155,7 +155,8 @@ def import_robot(args: argparse.Namespace) -> int:
             "--root-link"
         )
     xacro_args = _xacro_args(args.arg)
-    data, text, code = _import(find_description(args.file), xacro_args, args)
+    path, own_args = find_description(args.file)
+    data, text, code = _import(path, {**own_args, **xacro_args}, args)
     opt.print_result(args, data, lambda: text)
     return code
 
@@ -169,19 +170,16 @@ def _xacro_args(words: Sequence[str]) -> dict[str, str]:
     return {key: value for key, _, value in pairs}
 
 
-def _import(
-    description: NamedDescription, xacro_args: Mapping[str, str], args: argparse.Namespace
-) -> Written:
+def _import(path: Path, xacro_args: Mapping[str, str], args: argparse.Namespace) -> Written:
     """Import a robot, and write its bundle and, if asked for, its manifest."""
     from morphgen.grammar import robot_source
 
-    licence = args.licence or description.licence
-    if args.part and not licence:
+    if args.part and not args.licence:
         raise FormatError("--part: name the robot's licence by --licence, such as MIT")
-    with status(args, f"importing {description.path}"):
+    with status(args, f"importing {path}"):
         robot = robot_source.import_robot(
-            description.path,
-            {**description.args, **xacro_args},
+            path,
+            xacro_args,
             root=args.root,
             root_link=args.root_link,
             tool=args.tool,
@@ -191,17 +189,17 @@ def _import(
             skip_missing_meshes=args.skip_missing_meshes,
         )
     folder = bundle_folder(args.out, robot.name)
-    if description.path.resolve().is_relative_to(folder.resolve()):
+    if path.resolve().is_relative_to(folder.resolve()):
         raise FormatError(
-            f"{description.path}: its bundle would replace {folder}, the folder that it is in; "
+            f"{path}: its bundle would replace {folder}, the folder that it is in; "
             "choose another --name or --out"
         )
     part = None
     if args.part:  # refuses before the bundle is replaced
-        part = part_manifest(robot, folder / URDF, args.part, args.parts or _PARTS, licence)
+        part = part_manifest(robot, folder / URDF, args.part, args.parts or _PARTS, args.licence)
     data, text, code = write_checked(robot, args)
     if part is None:
         return data, text, code
     write_part(*part)
-    path = str(part[0])
-    return {**data, "part": path}, f"{text}\n{path}", code
+    manifest = str(part[0])
+    return {**data, "part": manifest}, f"{text}\n{manifest}", code

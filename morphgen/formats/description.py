@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -65,74 +64,29 @@ def is_mjcf(path: Path) -> bool:
         return root_tag(file.read(_MAX_HEAD)) == "mujoco"
 
 
-MENAGERIE, DESCRIPTIONS = "mujoco_menagerie", "robot_descriptions"  # modules of the packages
+DESCRIPTIONS = "robot_descriptions"  # module of the pip package, and prefix of its robots
 _PATHS = ("MJCF_PATH", "URDF_PATH", "XACRO_PATH")
 """Names of the paths in a module of ``robot_descriptions``; the first one that exists is taken."""
 
 
-@dataclass(frozen=True)
-class NamedDescription:
-    """The file of a robot, and what its collection says about it."""
-
-    path: Path
-    args: Mapping[str, str] = field(default_factory=dict)  # arguments of a xacro
-    licence: str = ""
-    """SPDX identifier of the robot's licence; empty if the collection does not say."""
-
-
-def find_description(text: str) -> NamedDescription:
-    """Return the file of a robot: of a collection, or the path itself."""
+def find_description(text: str) -> tuple[Path, dict[str, str]]:
+    """Return the file that a path or ``robot_descriptions:NAME`` names, and its xacro arguments."""
     collection, colon, name = text.partition(":")
-    if not colon or collection not in COLLECTIONS:
-        return NamedDescription(Path(text))
-    return COLLECTIONS[collection](name)
-
-
-def _of_menagerie(name: str) -> NamedDescription:
-    """Return a model of MuJoCo Menagerie: ``ROBOT``, or ``ROBOT/MODEL`` of a robot with several."""
-    if find_spec(MENAGERIE) is None:
-        raise FormatError(f"menagerie:{name}: pip install mujoco-menagerie, which has its robots")
-    package = import_module(MENAGERIE)
-    robot_name, _, model = name.partition("/")
-    if robot_name not in package.names():
-        raise FormatError(
-            f"menagerie:{name}: no robot {robot_name!r}{nearest(robot_name, package.names())}"
-        )
-    robot = package.get(robot_name)
-    models = [entry.name for entry in robot.entry_points if entry.kind == "robot"]
-    model = model or robot.default_model
-    if model not in models:
-        raise FormatError(f"menagerie:{name}: no model {model!r}{nearest(model, models)}")
-    try:
-        return NamedDescription(Path(robot.xml(model)), licence=robot.license)
-    except package.MenagerieError as error:
-        raise FormatError(f"menagerie:{name}: {error}") from error
-
-
-def _of_descriptions(name: str) -> NamedDescription:
-    """Return the file of a module of ``robot_descriptions``."""
+    if not colon or collection != DESCRIPTIONS:
+        return Path(text), {}
     spec = find_spec(DESCRIPTIONS)
     if spec is None:
-        raise FormatError(
-            f"{DESCRIPTIONS}:{name}: pip install {DESCRIPTIONS}, which has its robots"
-        )
+        raise FormatError(f"{text}: pip install {DESCRIPTIONS}, which has its robots")
     modules = pkgutil.iter_modules(spec.submodule_search_locations)
     names = [module.name for module in modules if module.name.endswith("_description")]
     if name not in names:
-        raise FormatError(f"{DESCRIPTIONS}:{name}: no such robot{nearest(name, names)}")
+        raise FormatError(f"{text}: no such robot{nearest(name, names)}")
     try:
         module = import_module(f"{DESCRIPTIONS}.{name}")
     except Exception as error:  # whatever the package's download raises, such as GitCommandError
-        raise FormatError(f"{DESCRIPTIONS}:{name}: cannot be loaded: {error}") from error
+        raise FormatError(f"{text}: cannot be loaded: {error}") from error
     for key in _PATHS:
         if path := getattr(module, key, None):
             args = getattr(module, "XACRO_ARGS", {}) if key == "XACRO_PATH" else {}
-            return NamedDescription(Path(path), {name: str(args[name]) for name in args})
-    raise FormatError(f"{DESCRIPTIONS}:{name}: the module has none of {', '.join(_PATHS)}")
-
-
-COLLECTIONS: dict[str, Callable[[str], NamedDescription]] = {
-    "menagerie": _of_menagerie,
-    DESCRIPTIONS: _of_descriptions,
-}
-"""Functions that find a robot by its name, by the name of the collection."""
+            return Path(path), {name: str(args[name]) for name in args}
+    raise FormatError(f"{text}: the module has none of {', '.join(_PATHS)}")
