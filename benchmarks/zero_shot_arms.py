@@ -26,6 +26,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -41,13 +42,14 @@ from morphgen.processes import parallel_map
 from morphgen.rl.baselines import BASELINES, Baseline
 from morphgen.rl.evaluation import (
     EvalConfig,
-    episodes_again,
+    MakeController,
     eval_config_of,
     evaluate,
+    run_all,
     zero_shot,
     zero_shot_data,
 )
-from morphgen.rl.inference import Mode
+from morphgen.rl.inference import Policy, PolicyController
 from morphgen.rl.runs.checkpoint import Interface, read_checkpoint
 from morphgen.rl.runs.robot_source import robot_source, specs_of
 from morphgen.rl.scores import Score, success_interval, success_of
@@ -123,19 +125,21 @@ class MeasuringErrors:
         """Return the label of a robot and its errors; the argument is as of ``Measuring``."""
         label, words = robot
         source = robot_source(words, "reach", obstacles=self.obstacles)
-        (spec,) = specs_of(source, GoalConfig(tasks=self.config.tasks))
-        chosen = [(spec.robot.name, i) for i in range(self.config.episodes)]
+        specs, seed = specs_of(source, GoalConfig(tasks=self.config.tasks)), self.config.seed
         run, learner = read_checkpoint(self.policy)
-        controllers: dict[str, tuple[Baseline | tuple[dict[str, Any], Mode], Interface]] = {
-            name_of(self.policy): ((learner, "deterministic"), run.interface),
-            "path": (PathBaseline("path", ""), Interface(observe=PATH)),
-            **{name: (BASELINES[name], Interface()) for name in ("ik", "jacobian")},
+        policy = PolicyController(Policy(learner, "deterministic", seed))
+        controllers: dict[str, tuple[MakeController, Interface]] = {
+            name_of(self.policy): (lambda: policy, run.interface),
+            "path": (partial(PathBaseline("path", "").make, seed), Interface(observe=PATH)),
+            **{
+                name: (partial(BASELINES[name].make, seed), Interface())
+                for name in ("ik", "jacobian")
+            },
         }
         errors = {}
-        for name, (controller, interface) in controllers.items():
-            episodes = episodes_again(
-                controller, source, self.config, interface, chosen, whole=True
-            )
+        for name, (make, interface) in controllers.items():
+            (episodes,) = run_all(make, specs, self.config, interface, ())
+            episodes = episodes[: self.config.episodes]
             errors[name] = {
                 key: [round(getattr(episode, key), 6) for episode in episodes]
                 for key in ("distance", "angle")

@@ -15,7 +15,7 @@ import numpy as np
 from morphgen.errors import TaskError
 from morphgen.model.kinematics import reach
 from morphgen.progress import part_of, show_progress, stage
-from morphgen.rl.baselines import BASELINES, ZERO, Baseline, Controller, baselines_for
+from morphgen.rl.baselines import BASELINES, ZERO, Controller, baselines_for
 from morphgen.rl.baselines.simple import Random
 from morphgen.rl.config import differences
 from morphgen.rl.inference import Episode, Mode, Policy, PolicyController, run_episodes
@@ -41,7 +41,6 @@ from morphgen.rl.scores import (
 )
 from morphgen.rl.shipped_policies import name_of
 from morphgen.splits.split import Side
-from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, evaluation_simulator
 from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
 from morphgen.tasks.scenes.make import batch_from_specs
@@ -170,7 +169,7 @@ def evaluate(
     total = math.prod(_rounds(config)) * len(specs)
     for i, make in enumerate(controllers):
         with part_of(len(controllers) * total, i * total):
-            new_episodes = _run_all(make, specs, config, interface, library)
+            new_episodes = run_all(make, specs, config, interface, library)
         for robot_episodes, new in zip(episodes, new_episodes, strict=True):
             robot_episodes.extend(new)
     random_episodes = _random_episodes(source, replace(config, workers=1), tasks)
@@ -205,7 +204,7 @@ def _random_episodes(
 ) -> list[list[Episode]]:
     """Return the episodes of the random policy by robot; memoised, for all modes of a policy."""
     make, library = partial(Random, config.seed), tuple(map(Path, source.library))
-    return _run_all(make, _specs(source, config, tasks), config, Interface(), library)
+    return run_all(make, _specs(source, config, tasks), config, Interface(), library)
 
 
 def _rounds(config: EvalConfig) -> tuple[int, int]:
@@ -214,7 +213,7 @@ def _rounds(config: EvalConfig) -> tuple[int, int]:
     return rounds, -(-config.episodes // rounds)
 
 
-def _run_all(
+def run_all(
     make: MakeController,
     specs: Sequence[EnvSpec],
     config: EvalConfig,
@@ -230,82 +229,23 @@ def _run_all(
     total = envs_per_robot * rounds * len(specs)
     for first in range(0, envs_per_robot, batch_envs):
         num_envs = min(batch_envs, envs_per_robot - first) * len(specs)
-        batch = _batch(specs, first * len(specs), num_envs, config, interface, library)
-        try:
+        batch = batch_from_specs(
+            specs,
+            num_envs,
+            first=first * len(specs),
+            sim=config.sim,
+            seed=int(np.random.SeedSequence([EVAL_SEED_OFFSET, config.seed]).generate_state(1)[0]),
+            workers=config.workers,
+            layouts="eval",
+            device=simulator.devices[0],
+            library=library,
+            **vars(interface),
+        )
+        with closing(batch), part_of(total, first * rounds * len(specs)):
             controller = controller or make()
-            with part_of(total, first * rounds * len(specs)):
-                new_episodes = run_episodes(batch, controller, rounds)
-            for episode in new_episodes:
+            for episode in run_episodes(batch, controller, rounds):
                 episodes[episode.robot_index].append(episode)
-        finally:
-            batch.close()
     return episodes
-
-
-def _batch(
-    specs: Sequence[EnvSpec],
-    first: int,
-    num_envs: int,
-    config: EvalConfig,
-    interface: Interface,
-    library: tuple[Path, ...],
-) -> TaskBatch:
-    """Make environments of an evaluation, from the one with the number ``first`` on."""
-    return batch_from_specs(
-        specs,
-        num_envs,
-        first=first,
-        sim=config.sim,
-        seed=int(np.random.SeedSequence([EVAL_SEED_OFFSET, config.seed]).generate_state(1)[0]),
-        workers=config.workers,
-        layouts="eval",
-        device=SIMULATORS[config.sim].devices[0],
-        library=library,
-        **vars(interface),
-    )
-
-
-def episodes_again(
-    controller: Baseline | tuple[dict[str, Any], Mode],
-    source: Source,
-    config: EvalConfig,
-    interface: Interface,
-    chosen: Sequence[tuple[str, int]],
-    *,
-    whole: bool = False,
-) -> list[Episode]:
-    """Run episodes of an evaluation again, given by the robot's name and their number.
-
-    ``controller`` is a baseline, or the learner of a checkpoint with its mode. Where actions depend
-    on no other environment each episode has a batch of its own, unless the ``whole`` evaluation
-    is asked for; else all episodes are run.
-    """
-    library, tasks, is_alone = tuple(map(Path, source.library)), None, False
-    make: MakeController
-    if isinstance(controller, Baseline):
-        make = partial(controller.make, config.seed)
-        tasks, is_alone = controller.tasks, controller.is_independent
-    else:
-        learner, mode = controller
-        is_alone = mode == "deterministic"
-
-        def make() -> Controller:
-            return PolicyController(Policy(learner, mode, config.seed))
-
-    specs = _specs(source, config, tasks)
-    robots = {spec.robot.name: i for i, spec in enumerate(specs)}
-    rounds, _ = _rounds(config)
-    if whole or not is_alone:
-        episodes = _run_all(make, specs, config, interface, library)
-        return [episodes[robots[robot]][number] for robot, number in chosen]
-    found = []
-    for i, (robot, number) in enumerate(chosen):
-        env, earlier = divmod(number, rounds)
-        env_number = env * len(specs) + robots[robot]
-        batch = _batch(specs, env_number, 1, config, interface, library)
-        with closing(batch), part_of(len(chosen), i):
-            found.append(run_episodes(batch, make(), earlier + 1)[-1])
-    return found
 
 
 def eval_config_of(

@@ -129,11 +129,7 @@ class Release(Record, frozen=True):
     @property
     def stem(self) -> str:
         """Name of the archive without its suffix, and of the folder in it."""
-        return _stem(self.name, self.version)
-
-
-def _stem(split: str, release_version: str) -> str:
-    return f"{split.replace('/', '-')}-{release_version}"
+        return f"{self.name.replace('/', '-')}-{self.version}"
 
 
 def _is_date(text: str) -> bool:
@@ -335,16 +331,6 @@ class ReleaseReport:
     bytes: int  # size of the archive
 
 
-def require_releasable(
-    split: Split, library: Library, request: ReleaseRequest
-) -> tuple[licences.LicencedPart, ...]:
-    """Require valid names and allowed licences of a release; return the parts of its robots."""
-    parts = licences.licenced_parts(split, library)
-    licences.require_allowed(split, parts, request.allowed_licences)
-    _release(split, request)
-    return parts
-
-
 def check_release(
     split: Split, library: Library, request: ReleaseRequest, *, jobs: int = 1
 ) -> tuple[Release, tuple[licences.LicencedPart, ...]]:
@@ -352,7 +338,9 @@ def check_release(
 
     Return the description of the release and the parts of the robots.
     """
-    parts = require_releasable(split, library, request)
+    parts = licences.licenced_parts(split, library)
+    licences.require_allowed(split, parts, request.allowed_licences)
+    release = _release(split, request)
     audited = audit(split, library, jobs=jobs)
     if not audited.passed():
         first = next(each for each in audited.findings if each.severity == "error")
@@ -360,12 +348,7 @@ def check_release(
             f"{split.name} fails its audit: {first.code} at {first.where}: {first.why}; see "
             "morphgen split audit"
         )
-    return _release(split, request), parts
-
-
-def archive_path(out: Path, split: Split, release_version: str) -> Path:
-    """Return the path of the archive of a release in a folder."""
-    return out / f"{_stem(split.name, release_version)}.zip"
+    return release, parts
 
 
 def release_split(

@@ -35,8 +35,6 @@ class Baseline:
     """Import path of the controller's class, as ``module:class``; imported when it is used."""
     tasks: tuple[str, ...] | None = None
     """Tasks that the baseline is for; None for all tasks."""
-    is_independent: bool = False
-    """Whether its actions in an environment depend on no other environment of the batch."""
 
     def suits(self, tasks: Iterable[str]) -> bool:
         """Return whether the baseline is for any of the tasks."""
@@ -50,10 +48,8 @@ class Baseline:
 
 
 RANDOM = Baseline("random", "morphgen.rl.baselines.simple:Random")
-ZERO = Baseline("zero", "morphgen.rl.baselines.simple:Zero", is_independent=True)
-JACOBIAN = Baseline(
-    "jacobian", "morphgen.rl.baselines.simple:JacobianColumns", ("reach",), is_independent=True
-)
+ZERO = Baseline("zero", "morphgen.rl.baselines.simple:Zero")
+JACOBIAN = Baseline("jacobian", "morphgen.rl.baselines.simple:JacobianColumns", ("reach",))
 IK = Baseline("ik", "morphgen.rl.baselines.ik:InverseKinematics", ("reach",))
 SCRIPTED = Baseline(
     "scripted",

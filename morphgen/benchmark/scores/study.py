@@ -24,16 +24,19 @@ from morphgen.errors import BenchmarkError, MorphgenError, TaskError
 from morphgen.formats.files import LOCK, write_file
 from morphgen.progress import stage
 from morphgen.rl.agents import AGENTS
-from morphgen.rl.baselines import BASELINES, Baseline
+from morphgen.rl.baselines import BASELINES
 from morphgen.rl.demonstrations.recording import TOLERANCE
-from morphgen.rl.evaluation import EvalConfig, episodes_again, evaluate_baseline, evaluate_run
-from morphgen.rl.inference import MODES, Episode, Mode
+from morphgen.rl.evaluation import (
+    EvalConfig,
+    evaluate_baseline,
+    evaluate_checkpoints,
+    evaluate_run,
+)
+from morphgen.rl.inference import MODES, Mode
 from morphgen.rl.runs.checkpoint import (
     CHECKPOINT,
-    Interface,
     RunConfig,
     config_from,
-    read_checkpoint,
     require_open,
     require_same_config,
 )
@@ -347,27 +350,30 @@ def write_tables(folder: Path, cells: Sequence[Cell]) -> list[Path]:
 
 @dataclass(frozen=True)
 class ReplayedEpisode:
-    """An episode of a submission beside the same one in the simulator."""
+    """An episode of a submission beside the same one in an evaluation that was run again."""
 
     robot: RobotOutcomes
     number: int  # number of the episode, from 0
-    episode: Episode
+    again: RobotOutcomes
 
     @property
     def agrees(self) -> bool:
         """Whether success and final distance [m] are those of the submission."""
-        success, distance = self.robot.success[self.number], self.robot.distance[self.number]
-        is_near = abs(self.episode.distance - distance) <= TOLERANCE
-        return is_near and self.episode.success == success
+        (won, far), (won_again, far_again) = self._outcomes
+        return won == won_again and abs(far - far_again) <= TOLERANCE
+
+    @property
+    def _outcomes(self) -> list[tuple[bool, float]]:
+        both = (self.robot, self.again)
+        return [(each.success[self.number], each.distance[self.number]) for each in both]
 
     def __str__(self) -> str:
         """Return a line: the episode, and what it gives if that is something else."""
-        own = self.robot.success[self.number], self.robot.distance[self.number]
-        again = self.episode.success, self.episode.distance
-        texts = [f"{'success' if won else 'failure'} at {far:.4f} m" for won, far in (own, again)]
+        own, again = (
+            f"{'success' if won else 'failure'} at {far:.4f} m" for won, far in self._outcomes
+        )
         where = f"{self.robot.side} robot {self.robot.robot}, episode {self.number}"
-        verdict = "agrees" if self.agrees else f"DIFFERS: again {texts[1]}"
-        return f"{where}: {texts[0]}: {verdict}"
+        return f"{where}: {own}: {'agrees' if self.agrees else f'DIFFERS: again {again}'}"
 
 
 def needs_checkpoint(submission: Submission) -> bool:
@@ -385,19 +391,7 @@ def replay_submission(
     checkpoint: Path | None = None,
     library: tuple[Path, ...] = (),
 ) -> Iterator[ReplayedEpisode]:
-    """Run random episodes of a submission again with a checkpoint, or the method of its name."""
-    interface = Interface()
-    controller: Baseline | tuple[dict[str, Any], Mode]
-    if checkpoint is None and not submission.mode:
-        controller = BASELINES[submission.method]
-    else:
-        files = list(checkpoint_files(checkpoint_path(checkpoint or submission.method)))
-        if len(files) > 1:
-            raise BenchmarkError(
-                f"{where}: {checkpoint} has policies of single robots; expected one checkpoint"
-            )
-        run, learner = read_checkpoint(files[0])
-        interface, controller = run.interface, (learner, submission.mode or "deterministic")
+    """Run the evaluation of a submission again, and yield random episodes of both."""
     rules = protocol_from(submission.evaluation, where)
     config = EvalConfig(rules.episodes, rules.simulator, rules.seed, 1, tuple(rules.goals.tasks))
     pairs = [(robot, i) for robot in submission.robots for i in range(len(robot.score))]
@@ -408,14 +402,17 @@ def replay_submission(
         own = [pairs[i] for i in picked if pairs[i][0].side == side]
         if not own:
             continue
-        chosen = [(robot.robot, number) for robot, number in own]
-        # A batch of one rounds otherwise than that of the evaluation, which a policy may amplify:
-        # what differs is judged by the whole evaluation.
-        for whole in (False, True):
-            again = episodes_again(
-                controller, replace(source, side=side), config, interface, chosen, whole=whole
-            )
-            found = list(map(ReplayedEpisode, *zip(*own, strict=True), again))
-            if all(each.agrees for each in found):
-                break
-        yield from found
+        if checkpoint is None and not submission.mode:
+            scores = evaluate_baseline(submission.method, replace(source, side=side), config)
+        else:
+            files = list(checkpoint_files(checkpoint_path(checkpoint or submission.method)))
+            mode = submission.mode or "deterministic"
+            scores = evaluate_checkpoints(files, replace(source, side=side), config, mode)
+        again = {score.robot: score.outcomes for score in scores}
+        for robot, number in own:
+            if len(robot.score) != len(again[robot.robot].score):
+                raise BenchmarkError(
+                    f"{where}: {side} robot {robot.robot}: {len(robot.score)} episodes; its "
+                    f"evaluation has {len(again[robot.robot].score)}"
+                )
+            yield ReplayedEpisode(robot, number, again[robot.robot])
