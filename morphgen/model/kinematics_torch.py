@@ -1,4 +1,4 @@
-"""Kinematics of many robots in one batch of torch tensors, differentiable, on any device.
+"""Kinematics of many robots in one batch of torch tensors, on any device.
 
 The functions have the names, formulas and results of ``morphgen.model.kinematics``. Robots are
 compiled once: ``compile_tree`` for the poses of all links, ``compile_chain`` for the pose and the
@@ -284,8 +284,6 @@ class FramePositions:
         self._T, self._A, self._B = parts.permute(0, 2, 3, 4, 1).contiguous()
         self._point = chain.T_joint_frame[robot_index, :3, 3].T.contiguous()
         gain = joints.gain[robot_index].transpose(0, 1)
-        # Without independent joints, a column of zeros stands for one that all joints follow.
-        gain = torch.nn.functional.pad(gain, (0, gain.shape[2] == 0))
         self._leader = gain.abs().argmax(dim=2)
         self._gain = torch.gather(gain, 2, self._leader[..., None])[..., 0].contiguous()
         self._offset = joints.offset[robot_index].T.contiguous()
@@ -293,7 +291,6 @@ class FramePositions:
 
     def __call__(self, q: torch.Tensor) -> torch.Tensor:
         """Return positions in the root frames, shape (n, 3) [m], at q, shape (n, J)."""
-        q = torch.nn.functional.pad(q, (0, q.shape[1] == 0))
         positions = self._gain * torch.gather(q.T, 0, self._leader) + self._offset
         a = torch.where(self._prismatic, positions, torch.sin(positions))[:, None, None]
         b = torch.where(self._prismatic, 0.0, 1 - torch.cos(positions))[:, None, None]

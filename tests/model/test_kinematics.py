@@ -172,27 +172,6 @@ def test_a_robot_with_one_link():
     assert T.shape == (2, 1, 4, 4)
 
 
-@pytest.mark.parametrize("kind", ["revolute", "prismatic", "continuous"])
-def test_a_tool_whose_only_movable_joint_mimics_a_fixed_one(kind):
-    follower = Joint("g", kind, "b", "c", axis=(0, 0.6, 0.8), mimic=Mimic("f", -2.0, 0.3))
-    if kind != "continuous":
-        follower = replace(follower, limits=(-1.0, 1.0))
-    robot = Robot(
-        "still",
-        (Link("a"), Link("b"), Link("c")),
-        (Joint("f", "fixed", "a", "b", Pose((0.1, 0, 0))), follower),
-        (Frame("tool", "c", Pose((0.1, 0.2, 0.3))),),
-    )
-    expected = frame_pose(robot, np.zeros((4, 0)))[:, :3, 3]
-    assert abs(expected - (0.2, 0.2, 0.3)).max() > 0.01
-    np.testing.assert_allclose(frame_positions(robot, np.zeros((0, 4))).T, expected, atol=1e-12)
-    np.testing.assert_allclose(FramePosition(robot)([]), expected[0], atol=1e-12)
-    chain = batched.compile_chain([robot], dtype=torch.float64)
-    index, q = torch.zeros(4, dtype=torch.long), torch.zeros((4, 0), dtype=torch.float64)
-    positions = batched.frame_positions(chain, index, q)
-    np.testing.assert_allclose(positions, expected, atol=1e-12)
-
-
 def test_batch_is_the_stack_of_its_rows():
     robot = arm()
     q = random_configurations(robot, 12, np.random.default_rng(3)).reshape(3, 4, robot.dof)
@@ -401,15 +380,6 @@ def test_no_joint_exceeds_its_rotation_budget():
     assert batch.poses(q + within)[0].numpy() == pytest.approx(goals.numpy(), abs=5e-4)
     both = [batch.step(q, goals, rotations, rotation_budget=each) for each in (None, budget)]
     assert torch.equal(*both), "where all joints stay within it nothing is given up"
-
-
-def test_solutions_are_differentiable_in_their_goals():
-    batch = Batch(0, 1)
-    goals = (batch.poses(batch.home)[0] - 0.05).requires_grad_()
-    found, _ = batch.solve(batch.home, goals, damping=DAMPING, max_step=MAX_STEP)
-    tools = batch.poses(found)[0]
-    (gradient,) = torch.autograd.grad(tools.sum(), goals)
-    torch.testing.assert_close(gradient, torch.ones_like(goals), atol=0.02, rtol=0)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-6, 1e-3, 0.5, 1.5, 2.9, 3.0, 3.1415, math.pi])

@@ -3,17 +3,15 @@
 import gc
 import tempfile
 from dataclasses import replace
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 
 from helpers.faulty_robots import with_joint
-from helpers.robots import arm, finger
+from helpers.robots import arm
 from helpers.scenes import (
     homes,
-    mixed_scenes,
     push_scene,
     reach_scene,
     real_arm_scene,
@@ -23,16 +21,16 @@ from helpers.scenes import (
 )
 from morphgen.errors import SimulationError
 from morphgen.model.geometry import Pose
-from morphgen.model.kinematics import forward_kinematics, joint_limits
+from morphgen.model.kinematics import joint_limits
 from morphgen.tasks.sim.articulated import merge_rigid_links
-from morphgen.tasks.sim.base import GRAVITY, LAG, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
+from morphgen.tasks.sim.base import GRAVITY, SUBSTEPS, TIMESTEP, Block, Contacts, Scene
 
 pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 import pybullet
 
 from morphgen.tasks.sim import bullet
 from morphgen.tasks.sim.bullet import BulletSimulation
-from morphgen.tasks.sim.bullet_scene import FRICTION, OVERSPEED, MotorForces
+from morphgen.tasks.sim.bullet_scene import OVERSPEED
 
 PUSHING = (0.0, -0.2, 0.62, np.pi / 2, 0.0)
 """The gantry's plate upright behind the block, off the ground."""
@@ -104,13 +102,6 @@ def test_reset_removes_all_earlier_state(simulate, scene):
         assert torch.equal(found, expected), seed
 
 
-def test_robot_file_is_written_once(simulate, monkeypatch):
-    counted = Mock(side_effect=bullet.write_bundle)
-    monkeypatch.setattr(bullet, "write_bundle", counted)
-    simulate(*mixed_scenes(), *mixed_scenes())
-    assert counted.call_count == 3
-
-
 def test_a_diverged_environment_must_be_reset(simulate):
     simulation = simulate(push_scene())
     q, loaded = reset(simulation), client_of(simulation)
@@ -126,24 +117,6 @@ def test_client_limit_error_names_the_limit(monkeypatch):
     monkeypatch.setattr(pybullet, "connect", lambda *_: -1)
     with pytest.raises(SimulationError, match="no client left: a process has 1024"):
         BulletSimulation([push_scene()])
-
-
-@pytest.mark.parametrize("request_", ["arm=ur5 ee=plane", "arm=panda ee=panda_hand"])
-def test_link_poses_match_forward_kinematics(simulate, request_):
-    T = Pose.from_xyz_rpy((0.3, -0.2, 0.5), (0.2, 0.4, -0.7))
-    body = robot(request_)
-    simulation = simulate(Scene(body, T), contacts=Contacts(False, False))
-    q = np.array(body.home) + 0.1
-    reset(simulation, q)
-    loaded, merged = client_of(simulation), merge_rigid_links(body)
-    T_world_link = T.matrix @ forward_kinematics(body, q)
-    for link, k in zip(loaded.driven, merged.movable_joints, strict=True):
-        name = merged.joints[k].child
-        found = pybullet.getLinkState(
-            loaded.robot, link, computeForwardKinematics=True, physicsClientId=loaded.id
-        )
-        expected = T_world_link[body.link_index[name], :3, 3]
-        assert found[4] == pytest.approx(expected, abs=1e-6), name
 
 
 @pytest.mark.parametrize("pushes", [False, True])
@@ -200,13 +173,6 @@ def test_friction_follows_coulombs_law(simulate, friction, degrees):
     expected = 0.8**2 / (2 * friction * GRAVITY) * ahead
     moved = (simulation.object_pose[0, :2] - before).numpy()
     np.testing.assert_allclose(moved, expected, atol=0.05 * np.linalg.norm(expected))
-
-
-def test_robots_have_the_specified_friction(simulate):
-    loaded = client_of(simulate(push_scene()))
-    for link in (-1, *loaded.driven):
-        info = pybullet.getDynamicsInfo(loaded.robot, link, physicsClientId=loaded.id)
-        assert info[1] == FRICTION
 
 
 def test_plate_passes_through_the_block_without_contacts(simulate):
@@ -288,17 +254,3 @@ def test_nothing_is_left_of_a_simulation(scratch, closes):
     gc.collect()
     assert not any(map(pybullet.isConnected, clients))
     assert [*scratch.iterdir()] == []
-
-
-def limits(body, error, velocity=0.0, effort=1e9):
-    rows = len(body.movable_joints)
-    errors, velocities = (np.broadcast_to(each, rows).astype(float) for each in (error, velocity))
-    motors = MotorForces(body, [effort] * rows)
-    return motors.limits((errors, errors), (velocities, velocities))
-
-
-def test_force_is_zero_at_rest_and_limited_by_effort_and_speed_limit():
-    assert (limits(finger(), 0.0) == 0).all()
-    assert (limits(finger(), 0.05, effort=3.0) == 3).all()
-    fast = 2.0
-    assert (limits(finger(), 50.0) == limits(finger(), LAG * fast)).all()

@@ -37,8 +37,6 @@ from morphgen.tasks.scenes import obstacles
 from morphgen.tasks.scenes.env_specs import GoalConfig
 from morphgen.tasks.scenes.obstacles import (
     KEPT,
-    draw_boxes,
-    draw_layouts,
     fewest_goals,
     layouts_of,
     place_boxes,
@@ -272,27 +270,6 @@ def test_a_robot_whose_tool_stays_in_place_has_no_goals(folder):
     body = Robot("spinner", (Link("base"), rod), (joint,), (tool,), (0.0,))
     with pytest.raises(TaskError, match="'spinner' cannot reach: over 12 configurations its tool"):
         sample_goals(body, folder)
-
-
-def layouts_in(body):
-    boxes = draw_boxes(body, 8, (0.5, 0.7), np.random.default_rng(0))
-    space = FreeSpace(Scene(body, obstacles=boxes, ground=LIFTED))
-    everything = np.ones(1, bool)
-    return draw_layouts(space, (1, 1), np.random.SeedSequence(0), lambda _: everything)
-
-
-def test_obstacles_that_block_too_much_space_are_redrawn(body, monkeypatch):
-    boxes = draw_boxes(body, 8, (0.5, 0.7), np.random.default_rng(0))
-
-    def left(share):
-        monkeypatch.setattr(obstacles, "KEPT", share)
-        layouts, _ = layouts_in(body)
-        q, _ = FreeSpace(Scene(body, ground=LIFTED)).sample(200, np.random.default_rng(1))
-        placed = place_boxes(boxes, layouts[0])
-        return FreeSpace(Scene(body, obstacles=placed, ground=LIFTED)).free(q).mean()
-
-    assert left(0.0) < 0.6
-    assert left(0.7) > 0.6
 
 
 def test_layouts_do_not_depend_on_the_numbers_of_goals_and_layouts(body, folder):

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.device_reads import device_reads
 from helpers.goal_sets import draw_spec
 from helpers.scenes import robot as compose
 from morphgen.errors import TaskError
@@ -442,25 +441,6 @@ def test_the_closeness_is_that_of_the_collision_shapes(batch):
     assert np.mean(errors) < 0.008
 
 
-def test_the_derivative_is_that_of_finite_differences(batch):
-    batch.reset()
-    q, limit = batch.q, CLEARANCES[-1]
-    step = batch.robot_tables.max_step[batch.env_robot_index]
-    observed, checked = channel(batch), 0
-    for joint in range(q.shape[1]):
-        change = torch.zeros_like(q)
-        change[:, joint] = 1e-3
-        ends = [channel(batch, q + sign * change)[:, joint, 1] for sign in (-1, 1)]
-        closeness, rate = observed[:, joint, 1], observed[:, joint, 2]
-        expected = -(ends[1] - ends[0]) * limit / 2e-3 * COLUMN_SCALE * step[:, joint] * closeness
-        # Where the nearest pair changes in between, both ends are farther than the middle says.
-        smooth = ((ends[0] + ends[1]) / 2 - closeness).abs() < 1e-4
-        near = (closeness > 0) & (closeness < 1) & smooth
-        torch.testing.assert_close(rate[near], expected[near], atol=0.03, rtol=0.03)
-        checked += int((near & (rate.abs() > 0.05)).sum())
-    assert checked > 30
-
-
 def test_environments_without_obstacles_see_zeros_and_the_others_what_they_see_alone(
     among_obstacles, cache
 ):
@@ -480,15 +460,6 @@ def test_environments_without_obstacles_see_zeros_and_the_others_what_they_see_a
         torch.testing.assert_close(channel(alone, q)[0], channel(mixed)[env, : q.shape[1]])
     alone = batch_from_specs([free], 1, sim="mujoco", observe=OBSERVE)
     assert not alone.reset()["clearance"].any()
-
-
-def test_the_channel_reads_no_tensor(batch):
-    batch.reset()
-    q, object_pose = batch.q, batch.simulation.object_pose
-    goals = batch.groups.tool_targets(object_pose, 0)
-    with device_reads() as reads:
-        batch.observation._kinematics(q, q, goals, object_pose)
-    assert not reads.found
 
 
 def test_meshes_are_refused(specs, tmp_path):

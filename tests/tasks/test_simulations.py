@@ -538,15 +538,6 @@ def test_invalid_block_poses_are_rejected(value, words):
         sim.reset(torch.tensor([True]), torch.zeros(1, 5), torch.full((1, 7), value))
 
 
-def test_equal_scenes_share_one_model():
-    scenes = [push_scene(), push_scene(), push_scene(mass=0.2), reach_scene()]
-    moved = replace(scenes[0], object=replace(scenes[0].block, pose=Pose((0.3, 0, 0.1))))
-    sim = MujocoSimulation([*scenes, moved])
-    models = [id(world.model) for world in sim._worlds]
-    assert models[0] == models[1] == models[4]
-    assert len(set(models)) == 3
-
-
 @pytest.mark.parametrize("request_", ["chain beads=7", "arm=widowx ee=widowx_gripper"])
 def test_full_speed_back_and_forth_is_stable(request_):
     """Strong motors move light links at their effort limits."""
@@ -712,20 +703,9 @@ def heavy_followers():
     )
 
 
-def folding():
-    """Three links that fold together, each twice as far as the one before."""
-    return chain(
-        rod("a", None, "first", "base", (0, 0, 1), 4, 0.4),
-        rod("b", "first", "second", "a", (0.4, 0, 0), 0.2, 0.4, gain=-2.0),
-        rod("c", "first", "third", "b", (0.4, 0, 0), 6, 0.4, gain=2.0),
-        rod("d", None, "hand", "c", (0.4, 0, 0), 1, 0.2),
-    )
-
-
 ROBOTS = {
     "parallelogram": parallelogram,
     "heavy followers": heavy_followers,
-    "folding": folding,
     "robotiq_2f85": lambda: robot("arm=ur5 ee=robotiq_2f85"),
     "gen3_lite_2f": lambda: robot("arm=ur5 ee=gen3_lite_2f"),
 }
