@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from typing import Any, cast
 
@@ -33,11 +32,6 @@ def dim(html: str) -> str:
 def link(address: Address, text: str) -> str:
     """Return a link to a page."""
     return f'<a href="{escape(address.query)}">{escape(text)}</a>'
-
-
-def button_link(address: Address, text: str) -> str:
-    """Return a link to a page that looks like a button."""
-    return f'<a class="button" href="{escape(address.query)}">{escape(text)}</a>'
 
 
 def choose_box(uri: str, label: str = "") -> str:
@@ -118,17 +112,11 @@ _UNITS = {"prismatic": ("m", "N", "m/s")}  # units of position, effort, velocity
 _ROTATION_UNITS = ("rad", "N m", "rad/s")
 
 
-@dataclass(frozen=True)
-class JointGroup:
-    """Independent joints that came with the same part."""
+def joint_groups(robot: Robot) -> list[tuple[str, str, list[int]]]:
+    """Return the independent joints by part: its label, its title, and indices of joints in q.
 
-    label: str  # label of the part, which begins the names of its joints; empty for unknown parts
-    title: str  # label and name of the part, such as `left_arm (ur5)`, or the one that both are
-    rows: tuple[int, ...]  # indices of the joints in q
-
-
-def joint_groups(robot: Robot) -> list[JointGroup]:
-    """Return the independent joints by part; a robot of unknown parts has one group."""
+    The label begins the names of the joints. A robot of unknown parts has one group without label.
+    """
     parts = cast(Sequence[Mapping[str, Any]], robot.provenance.get("parts", ()))
     names = {str(part["label"]): str(part["part"]) for part in parts}
     # The longest label first: a joint of "left_arm" does not belong to "left".
@@ -139,7 +127,7 @@ def joint_groups(robot: Robot) -> list[JointGroup]:
         label = next((label for label in labels if name.startswith(f"{label}_")), "")
         groups.setdefault(label, []).append(row)
     return [
-        JointGroup(label, part_title(label, names[label]) if label else "joints", tuple(rows))
+        (label, part_title(label, names[label]) if label else "joints", rows)
         for label, rows in groups.items()
     ]
 
@@ -147,19 +135,6 @@ def joint_groups(robot: Robot) -> list[JointGroup]:
 def part_title(label: str, part: str) -> str:
     """Return the label of a part with its name, or one of them if both are the same."""
     return label if label == part else f"{label} ({part})"
-
-
-def joint_hint(joint: Joint) -> str:
-    """Return a joint's kind and limits in a line."""
-    position, effort, speed = _UNITS.get(joint.kind, _ROTATION_UNITS)
-    low, high = joint.effective_limits
-    parts = [f"{joint.name}: {joint.kind}"]
-    parts.append(f"{low:.4g} to {high:.4g} {position}" if joint.limits else "no limits")
-    if joint.effort is not None:
-        parts.append(f"at most {joint.effort:.4g} {effort}")
-    if joint.velocity is not None:
-        parts.append(f"{joint.velocity:.4g} {speed}")
-    return ", ".join(parts)
 
 
 def slider_step(low: float, high: float) -> float:

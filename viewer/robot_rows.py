@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from morphgen.errors import FormatError
 from morphgen.files import file_stamp
@@ -21,8 +20,6 @@ from morphgen.grammar.robot_source import is_robot_folder
 from morphgen.grammar.sampling import INDEX, read_index, read_settings
 from morphgen.splits.split import Split, sided_members
 from morphgen.viewer import robot_uri
-
-T = TypeVar("T")
 
 SORTS = ("order", "name", "dof", "links", "reach", "mass")
 """Keys by which rows can be sorted; ``order`` is the order of the set."""
@@ -89,13 +86,6 @@ def sort_rows(rows: Iterable[Row], key: str) -> list[Row]:
     known = [row for row in rows if getattr(row, name) is not None]
     unknown = [row for row in rows if getattr(row, name) is None]
     return [*sorted(known, key=attrgetter(name), reverse=key.startswith("-")), *unknown]
-
-
-def select_page(rows: Sequence[T], number: int, size: int) -> tuple[list[T], int, int]:
-    """Return one page of rows, its number, and the number of pages (at least 1)."""
-    count = max(math.ceil(len(rows) / size), 1)
-    number = min(max(number, 1), count)
-    return list(rows[(number - 1) * size : number * size]), number, count
 
 
 def fact_range(rows: Iterable[Row], fact: str) -> tuple[float, float] | None:

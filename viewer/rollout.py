@@ -278,11 +278,6 @@ class Player:
             self._ended = True
             self._wake.notify()
 
-    def join(self, timeout: float) -> bool:
-        """Wait at most ``timeout`` seconds for the thread to end; return whether it has."""
-        self._thread.join(timeout)
-        return not self._thread.is_alive()
-
     def _command(self, key: str, work: Callable[[], object]) -> None:
         """Queue a command at the end; it replaces a waiting command of the same key."""
         with self._wake:

@@ -3,6 +3,7 @@
 import re
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ from morphgen.viewer.scene.population import (
     shape_poses,
 )
 from morphgen.viewer.scene.robot import robot_bounds
-from morphgen.viewer.scene.stage import View, fit_camera, project_points
+from morphgen.viewer.scene.stage import fit_camera, project_points
 
 
 def test_cards_of_a_gallery_lead_to_their_robots(shared_viewer):
@@ -124,11 +125,12 @@ def test_a_range_is_clipped_to_the_values_of_the_robots(text, expected):
 @pytest.mark.parametrize(
     ("text", "limits", "message"),
     [
-        ("5..9", (0.5, 1.5), r"reach=5\.\.9 excludes every robot.* they have 0\.5 to 1\.5 m"),
-        ("0..0.2", (0.5, 0.5), r"they have 0\.5 m"),
-        ("9..5", (0.5, 1.5), r"is no range.*expected LOW\.\.HIGH"),
-        ("nan..1", (0.5, 1.5), "is no range"),
-        ("much", (0.5, 1.5), "is no range"),
+        ("5..9", (0.5, 1.5), r"reach=5\.\.9 was left out; expected LOW\.\.HIGH that overlaps"),
+        ("0..0.2", (0.5, 0.5), r"overlaps 0\.5 m"),
+        ("1.2..0.8", (0.5, 1.5), r"overlaps 0\.5 to 1\.5 m"),
+        ("nan..1", (0.5, 1.5), "was left out"),
+        ("0.7..nan", (0.5, 1.5), "was left out"),
+        ("much", (0.5, 1.5), "was left out"),
         ("0..1", None, "no robot here has a known reach"),
     ],
 )
@@ -140,7 +142,7 @@ def test_a_range_that_cannot_be_used_is_refused(text, limits, message):
 @pytest.mark.parametrize(
     ("query", "message"),
     [
-        ("reach=50..90", "reach=50..90 excludes every robot, so it was left out"),
+        ("reach=50..90", "reach=50..90 was left out; expected LOW..HIGH that overlaps"),
         ("sort=colour", "sort=colour was left out; expected order, -order, name"),
         ("findings=some", "findings=some was left out; expected all, with, without"),
         ("role=train", "role=train was left out; expected all"),
@@ -150,6 +152,11 @@ def test_a_page_says_which_value_of_its_address_it_leaves_out(shared_viewer, que
     with PlainClient(shared_viewer.port, f"?gallery=robots/prims&{query}") as client:
         client.shows(message)
         client.shows("30 robots · page 1 of 2")
+
+
+def test_a_page_number_beyond_the_last_is_that_of_the_last(shared_viewer):
+    with PlainClient(shared_viewer.port, "?gallery=robots/prims&n=9") as client:
+        client.shows("30 robots · page 2 of 2")
 
 
 def test_an_empty_gallery_says_why(shared_viewer):
@@ -248,11 +255,10 @@ def test_a_camera_has_all_points_in_its_picture_and_touches_the_strictest_sides(
 
 
 def test_points_are_projected_to_the_picture():
-    down = View(np.array([0.0, 0.0, 5.0]), np.diag([1.0, -1.0, -1.0]), 1.0, 1.5)
-    points, depth = project_points(down, np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]))
-    np.testing.assert_allclose(points[0], (0.75, 0.5))
-    assert points[1, 0] > 0.75
-    assert points[2, 1] < 0.5
+    down = SimpleNamespace(position=np.array([0, 0, 5.0]), wxyz=np.array([0, 1.0, 0, 0]))
+    down.fov, down.aspect = 2 * np.arctan(0.5), 1.5  # 5 m high, 7.5 m wide
+    points, depth = project_points(down, np.array([[0, 0, 0], [1.5, 0, 0], [0, 1, 0]]))
+    np.testing.assert_allclose(points, [(0.5, 0.5), (0.7, 0.5), (0.5, 0.3)])
     np.testing.assert_allclose(depth, 5)
 
 
@@ -395,8 +401,8 @@ def test_compared_robots_stand_in_a_row_and_positions_are_clipped_or_left_out(vi
 
 
 def test_figures_link_to_robots_and_escape_names():
-    names, sides = ["<a>", "b"], ["train", "test"]
-    text = map_svg(np.array([[0.0, 0.0], [1.0, 0.5]]), names, sides, ["x y", "z"], {"z": "data:,"})
+    rows = [Row("<a>", "x y", role="train"), Row("b", "z", role="test")]
+    text = map_svg(np.array([[0.0, 0.0], [1.0, 0.5]]), rows, {"z": "data:,"})
     assert text.count("<image") == 1
     assert 'href="?robot=x%20y"' in text
     assert "&lt;a&gt;" in text
@@ -407,8 +413,7 @@ def test_figures_link_to_robots_and_escape_names():
     "points", [np.random.default_rng(0).normal(size=(60, 2)), np.zeros((60, 2))]
 )
 def test_pictures_of_a_map_do_not_cover_each_other(points):
-    names = [str(i) for i in range(60)]
-    text = map_svg(points, names, ["test"] * 60, names, {})
+    text = map_svg(points, [Row(str(i), str(i), role="test") for i in range(60)], {})
     pattern = r'class="point" x="([\d.]+)" y="([\d.]+)" width="([\d.]+)" height="([\d.]+)"'
     boxes = np.array(re.findall(pattern, text), dtype=float)
     low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]

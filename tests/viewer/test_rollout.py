@@ -317,12 +317,17 @@ def display():
     return Display()
 
 
+def require_ended(player):
+    player._thread.join(WAIT)
+    assert not player._thread.is_alive()
+
+
 @pytest.fixture
 def player(display):
     made = Player(display)
     yield made
     made.stop()
-    assert made.join(WAIT)
+    require_ended(made)
 
 
 def test_an_episode_plays_to_its_end_and_restarts(player, display):
@@ -386,7 +391,7 @@ def test_another_episode_frees_the_previous_one(player, display):
         display.steps.clear()
     assert [source.closed for source in sources] == [True, False]
     player.stop()
-    assert player.join(WAIT)
+    require_ended(player)
     assert sources[1].closed
 
 
@@ -416,7 +421,7 @@ def test_a_player_stops_while_it_loads(display):
     player.load(slow)
     assert begun.wait(WAIT)
     player.stop()
-    assert player.join(WAIT)
+    require_ended(player)
     assert source.closed
 
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 import base64
 import binascii
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 from urllib.parse import parse_qsl, quote, urlencode
 
 from morphgen.errors import MorphgenError, nearest
-from morphgen.viewer.app.workers import load_function
 
 PAGES: Mapping[str, str] = {
     "library": "morphgen.viewer.pages.gallery:show_library",
@@ -25,12 +23,7 @@ PAGES: Mapping[str, str] = {
     "play": "morphgen.viewer.pages.play:show",
     "demos": "morphgen.viewer.pages.play:show_demos",
 }
-"""The function that builds each page, by the page's key in the address (``?robot=...``)."""
-
-
-def load_page(name: str) -> Callable[[Any], None]:
-    """Import and return the function that builds a page for a ``Session``."""
-    return load_function(PAGES[name])  # only now: pages import much that others do not need
+"""The function that builds each page for a ``Session``, by the page's key in the address."""
 
 
 MAX_QUERY = 8000  # longest query [characters]

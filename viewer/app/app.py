@@ -22,12 +22,12 @@ from morphgen.grammar.robot_source import is_robot_folder
 from morphgen.rl.demonstrations.lerobot import is_data_set
 from morphgen.splits.split import split_names
 from morphgen.viewer import markup, robot_uri
-from morphgen.viewer.app.address import CHOSEN, Address, load_page, parse_address, parse_count
+from morphgen.viewer.app.address import CHOSEN, PAGES, Address, parse_address, parse_count
 from morphgen.viewer.app.frame import call
 from morphgen.viewer.app.server import MessageFilter, access_policy, start_server, stop_server
 from morphgen.viewer.app.session import BUG, DEFAULT_WIDTH, Session
 from morphgen.viewer.app.viser_internals import clear_page
-from morphgen.viewer.app.workers import SharedResults, Workers, named
+from morphgen.viewer.app.workers import SharedResults, Workers, load_function, named
 from morphgen.viewer.robot_files import change_tray
 from morphgen.viewer.scene.stage import BRAND, set_stage
 
@@ -173,7 +173,7 @@ def open_page(session: Session, find_address: Callable[[], object]) -> None:
         session.address = replace(address, chosen=()).with_state(theme="", tab="")
         session.show_address(session.title)
         session.show_tray()
-        load_page(address.page)(session)
+        load_function(PAGES[address.page])(session)  # pages import much that others do not need
         if session.tabs:
             session.run_script(call("openTabs", session.tabs.split(",")))
     except UnsoundError as error:

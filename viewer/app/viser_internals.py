@@ -36,7 +36,6 @@ ACCEPTED_MESSAGES: Mapping[str, type[Any]] = {
         _messages.TransformControlsUpdateMessage,
         _messages.TransformControlsDragStartMessage,
         _messages.TransformControlsDragEndMessage,
-        _messages.GetRenderResponseMessage,
     )
 }
 """Messages that browsers send on the viewer's pages, by type name. viser itself accepts more."""

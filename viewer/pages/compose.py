@@ -56,7 +56,6 @@ from morphgen.viewer.scene.robot import RobotView, add_robot, robot_bounds
 from morphgen.viewer.scene.stage import (
     CAMERA_DIRECTION,
     add_ground,
-    camera_view,
     look_at,
     project_points,
 )
@@ -612,9 +611,8 @@ class ComposeView:
         return change_text(self._ghost.robot, robot) if self._ghost else ""
 
     def _is_in_picture(self, low: Array, high: Array) -> bool:
-        picture = camera_view(self._session.client)
-        points, depths = project_points(picture, box_corners(low, high))
-        shares = points / (picture.aspect, 1.0)
+        camera = self._session.client.camera
+        shares, depths = project_points(camera, box_corners(low, high))
         return bool((depths > 0).all() and (abs(shares - 0.5) <= 0.5 - _EDGE).all())
 
 

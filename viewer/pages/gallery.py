@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from html import escape
@@ -143,23 +145,18 @@ def add_filter(gallery: Gallery) -> None:
 
 def parse_range(fact: str, text: str, limits: tuple[float, float] | None) -> tuple[float, float]:
     """Parse ``LOW..HIGH`` of an address."""
-    first, dots, last = text.partition("..")
-    try:
-        low, high = float(first), float(last if dots else "")
-    except ValueError:
-        low, high = 1.0, 0.0
-    where = f"{fact}={text[:40]}"
-    if not low <= high:
-        raise AddressError(f"{where} is no range, so it was left out; expected LOW..HIGH")
     if limits is None:
-        raise AddressError(f"{where} was left out: no robot here has a known {fact}")
-    if low > limits[1] + robot_rows.ROUNDING or high < limits[0] - robot_rows.ROUNDING:
-        ends = " to ".join(dict.fromkeys(f"{end:.4g}" for end in limits))
-        raise AddressError(
-            f"{where} excludes every robot, so it was left out: they have {ends} "
-            f"{robot_rows.UNITS[fact]}"
-        )
-    return max(low, limits[0]), min(high, limits[1])
+        raise AddressError(f"{fact}={text[:40]} was left out: no robot here has a known {fact}")
+    first, _, last = text.partition("..")
+    with suppress(ValueError):
+        low, high = max(float(first), limits[0]), min(float(last), limits[1])
+        if low <= high + robot_rows.ROUNDING:
+            return low, high
+    ends = " to ".join(dict.fromkeys(f"{end:.4g}" for end in limits))
+    raise AddressError(
+        f"{fact}={text[:40]} was left out; expected LOW..HIGH that overlaps {ends} "
+        f"{robot_rows.UNITS[fact]}"
+    )
 
 
 def _add_dropdown(gallery: Gallery, key: str, label: str, keys: Collection[str]) -> None:
@@ -305,7 +302,9 @@ def show_page(gallery: Gallery, number: int) -> None:
     session, state = gallery.session, gallery.session.state()
     passing = (row for row in gallery.rows if robot_rows.passes(row, state))
     rows = robot_rows.sort_rows(passing, state.get("sort") or "order")
-    gallery.page_rows, gallery.page_number, count = robot_rows.select_page(rows, number, PAGE_SIZE)
+    count = max(math.ceil(len(rows) / PAGE_SIZE), 1)
+    gallery.page_number = min(max(number, 1), count)
+    gallery.page_rows = rows[(gallery.page_number - 1) * PAGE_SIZE :][:PAGE_SIZE]
     session.show_state()
     total = "" if len(rows) == len(gallery.rows) else f" of {len(gallery.rows)}"
     noun = gallery.noun if len(gallery.rows) == 1 else f"{gallery.noun}s"
@@ -324,7 +323,8 @@ def show_page(gallery: Gallery, number: int) -> None:
 _COMPOSE = Address("compose", (DEFAULT_WORDS,))
 INTRODUCTION = (
     "<p>morphgen makes robots from a base, arms and end-effectors, and trains and tests policies "
-    f"on many of them.</p><p>{markup.button_link(_COMPOSE, 'Compose a robot')}</p>"
+    f'on many of them.</p><p><a class="button" href="{escape(_COMPOSE.query)}">'
+    "Compose a robot</a></p>"
 )
 """Text above the gallery of parts: the purpose of morphgen, and the link to Compose."""
 NONE_CHOSEN = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from itertools import combinations
@@ -42,48 +42,6 @@ from morphgen.viewer.scene.population import (
     move_roles,
 )
 from morphgen.viewer.scene.robot import robot_bounds
-
-MIDDLE = 0.5  # position of a slider whose joints are at home
-
-
-class RoleSliders:
-    """Sliders that move the joints of a role in all robots of a page; other joints stay at home."""
-
-    def __init__(self, session: Session, move: Callable[[], object]) -> None:
-        """Prepare for sliders; ``move`` is called after the user moved one."""
-        self.moved: dict[str, float] = {}  # shares of their ranges, of the roles that were moved
-        self._session, self._move = session, move
-        self._sliders: dict[str, viser.GuiSliderHandle[float]] = {}
-
-    def add(self, role: str, hint: str) -> None:
-        """Add the slider of a role, which is in the middle while nobody has moved it."""
-        session, moved = self._session, self.moved
-        slider = session.client.gui.add_slider(role, 0.0, 1.0, 0.01, MIDDLE, hint=hint)
-        self._sliders[role] = slider
-
-        def apply(text: str) -> None:
-            """Take over a position of an address, unless it is invalid; the robots move later."""
-            if (position := parse_value(slider, text)) is not None:
-                moved[role] = position
-                set_value(slider, position)
-
-        def read() -> None:
-            moved[role] = slider.value
-            self._move()
-
-        def write() -> str:
-            return f"{moved[role]:g}" if role in moved else ""
-
-        session.on_change(slider, read, f"move {role}")
-        session.keep(role.replace(" ", ""), write, apply)
-
-    def go_home(self) -> None:
-        """Move all roles home."""
-        self.moved.clear()
-        for slider in self._sliders.values():
-            set_value(slider, MIDDLE)
-        self._move()
-
 
 MAX_ROBOTS = 1000  # largest population [robots]
 _CHUNK = 20  # robots of one call of a worker
@@ -157,6 +115,7 @@ ARRANGEMENTS = {
 """Labels of the arrangements by their key in the address."""
 CAMERA_DIRECTION = (0.08, -0.8, 0.6)  # to the camera, which sees rows from left to right
 _NUM_NAMED = 5  # selected robots that are listed
+MIDDLE = 0.5  # position of a slider whose joints are at home
 NONE_TO_COMPARE = (
     "<h2>Compare two to four robots</h2>Tick the box of cards in a gallery, or of a robot's page, "
     "and press <i>compare</i> below."
@@ -228,7 +187,8 @@ class PopulationPage:
         home = gui.add_button("Home", icon=viser.Icon.HOME)
         bind(session, "arrange", self._arrange, tuple(ARRANGEMENTS))
         session.keep("select", lambda: format_selection(self.selected), self._apply_selection)
-        self._sliders = RoleSliders(session, self._move)
+        self._moved: dict[str, float] = {}  # shares of their ranges, of the roles that were moved
+        self._sliders: list[viser.GuiSliderHandle[float]] = []
         self._add_sliders()
         self._selection = gui.add_html("")
         select = gui.add_button_group("Select", ("all", "none"))
@@ -236,7 +196,7 @@ class PopulationPage:
             "Choose", icon=viser.Icon.CHECKBOX, hint="add them to the chosen robots"
         )
         session.on_change(self._arrange, self._show_arrangement, "arrange")
-        session.on_change(home, self._sliders.go_home)
+        session.on_change(home, self._go_home)
         session.on_change(
             select, lambda: self.select(np.full(len(population), select.value == "all"))
         )
@@ -299,11 +259,39 @@ class PopulationPage:
                 with gui.add_folder(title, expand_by_default=initial == "j"):
                     for name in names:
                         count = int((role == roles.index(name)).any(axis=1).sum())
-                        self._sliders.add(name, f"share of its range, of {count} robots")
+                        self._add_slider(name, f"share of its range, of {count} robots")
+
+    def _add_slider(self, role: str, hint: str) -> None:
+        """Add the slider of a role, which is in the middle while nobody has moved it."""
+        session, moved = self.session, self._moved
+        slider = session.client.gui.add_slider(role, 0.0, 1.0, 0.01, MIDDLE, hint=hint)
+        self._sliders.append(slider)
+
+        def apply(text: str) -> None:
+            """Take over a position of an address, unless it is invalid; the robots move later."""
+            if (position := parse_value(slider, text)) is not None:
+                moved[role] = position
+                set_value(slider, position)
+
+        def read() -> None:
+            moved[role] = slider.value
+            self._move()
+
+        def write() -> str:
+            return f"{moved[role]:g}" if role in moved else ""
+
+        session.on_change(slider, read, f"move {role}")
+        session.keep(role.replace(" ", ""), write, apply)
+
+    def _go_home(self) -> None:
+        self._moved.clear()
+        for slider in self._sliders:
+            set_value(slider, MIDDLE)
+        self._move()
 
     def _configurations(self) -> NDArray[np.float64]:
         """Return the configurations of all robots, shape (n, J) [rad or m]."""
-        return move_roles(self.population, self.population.home, self._sliders.moved)
+        return move_roles(self.population, self.population.home, self._moved)
 
     def _move(self) -> None:
         self.scene.move(self.scene.positions, self._configurations())
@@ -348,11 +336,10 @@ class PopulationPage:
 
     def _inside(self, event: viser.SceneRectSelectEvent) -> NDArray[np.bool_]:
         """Return which robots have their middle inside a rectangle of the picture, shape (n,)."""
-        view = stage.camera_view(self.session.client)
-        corners = np.array([event.screen_min, event.screen_max]) * (view.aspect, 1.0)
+        corners = np.array([event.screen_min, event.screen_max])
         centres = self.population.home_bounds.mean(axis=1)
         centres[:, :2] += self.scene.positions
-        points, depth = stage.project_points(view, centres)
+        points, depth = stage.project_points(self.session.client.camera, centres)
         inside = (points >= corners.min(axis=0)) & (points <= corners.max(axis=0))
         return np.asarray(inside.all(axis=1) & (depth > 0))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import io
 import math
 import shlex
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +11,6 @@ from typing import Any, Literal
 
 import numpy as np
 import viser
-from PIL import Image
 
 from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
@@ -35,7 +33,6 @@ from morphgen.viewer.scene import robot as scene_robot
 from morphgen.viewer.scene import stage as scene_stage
 
 PANEL_WIDTH = 390.0  # width of the panel [pixels]
-RENDER_TIMEOUT = 60.0  # time in which the browser has to send a screenshot [s]
 NO_LINK = "(none)"  # choice of the dropdown of links that selects none
 ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": 180 / math.pi}  # number per radian
 
@@ -175,23 +172,22 @@ class RobotPage:
             folder.remove()
         self._folders = []
         sliders, limits = {}, kinematics.joint_limits(robot)
-        for group in markup.joint_groups(robot):
+        for label, title, rows in markup.joint_groups(robot):
             with self._slider_box:
-                self._folders.append(folder := gui.add_folder(group.title))
-            for row in group.rows:
+                self._folders.append(folder := gui.add_folder(title))
+            for row in rows:
                 joint, scale = robot.joints[robot.independent_joints[row]], self._scale(row)
                 low, high = (float(value) * scale for value in limits[row])
                 step = markup.slider_step(low, high)
                 value = markup.rounded(float(self.q[row]) * scale, step)
                 with folder:
                     sliders[row] = gui.add_slider(
-                        joint.name.removeprefix(f"{group.label}_"),
+                        joint.name.removeprefix(f"{label}_"),
                         low,
                         max(high, low + 1e-9),  # viser rejects an empty range
                         step,
                         float(np.clip(value, low, high)),
                         marks=tuple((value, f"{value:.3g}") for value in (low, high)),
-                        hint=markup.joint_hint(joint),
                     )
                 session.on_change(sliders[row], functools.partial(self._slide, row), f"move {row}")
         self._sliders = [sliders[row] for row in range(robot.dof)]
@@ -312,11 +308,9 @@ class Layers:
 
     def follow(self) -> None:
         """Draw what depends on the robot's configuration."""
-        if self._robot.tool:
-            T_root_tool = kinematics.frame_pose(self._robot, self._page.q)
-            if self._gizmo is not None and not self._is_dragging:
-                pose = Pose.from_matrix(T_root_tool)
-                self._gizmo.position, self._gizmo.wxyz = pose.position, pose.quaternion
+        if self._gizmo is not None and not self._is_dragging:
+            pose = Pose.from_matrix(kinematics.frame_pose(self._robot, self._page.q))
+            self._gizmo.position, self._gizmo.wxyz = pose.position, pose.quaternion
 
     def _write(self) -> str:
         shown = ",".join(name for name, box in self._boxes.items() if box.value)
@@ -462,7 +456,6 @@ def _add_downloads(page: RobotPage) -> None:
         "Bundle (.zip)": (".zip", lambda: zip_files(name, bundle())),
         "URDF": (".urdf", lambda: bundle()[URDF]),
         "MJCF": (".xml", lambda: bundle()[MJCF]),
-        "Screenshot": (".png", lambda: _screenshot(session.client)),
         "Web page (.html)": (".html", lambda: run(robot_page, robot, session.dark)),
         "Turntable (.mp4)": (".mp4", lambda: run(turntable, robot, ".mp4")),
         "Turntable (.gif)": (".gif", lambda: run(turntable, robot, ".gif")),
@@ -484,15 +477,3 @@ def _command(page: RobotPage) -> str:
     if page.uri.startswith(robot_uri.UPLOAD):
         return f"# for the file that you uploaded: morphgen show FILE\n{comment}".rstrip()
     return comment
-
-
-def _screenshot(client: viser.ClientHandle) -> bytes:
-    """Return what the browser shows of the scene as a PNG."""
-    height, width = client.camera.image_height, client.camera.image_width
-    try:
-        image = client.get_render(height, width, transport_format="png", timeout=RENDER_TIMEOUT)
-    except (OSError, ValueError, RuntimeError, TimeoutError) as error:
-        raise MorphgenError(f"the browser sent no picture: {error}") from error
-    content = io.BytesIO()
-    Image.fromarray(image).save(content, "PNG")
-    return content.getvalue()

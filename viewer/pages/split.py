@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from html import escape
 from pathlib import Path
@@ -27,15 +27,15 @@ from morphgen.benchmark.survey import (
 from morphgen.encoding.similarity import MEASURES, classical_mds, to_distances
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import Library
-from morphgen.splits.split import SIDES, Member, Side, Split, sided_members, split_id
+from morphgen.splits.split import SIDES, Split, split_id
 from morphgen.typing import Array
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address
 from morphgen.viewer.app.session import Session
 from morphgen.viewer.app.workers import Workers
 from morphgen.viewer.pages import gallery as gallery_page
-from morphgen.viewer.robot_rows import split_rows
-from morphgen.viewer.robot_uri import member_uri, resolve_split
+from morphgen.viewer.robot_rows import Row, split_rows
+from morphgen.viewer.robot_uri import resolve_split
 
 PANEL_WIDTH = 520.0  # largest width of the controls [pixels]
 PANEL_SHARE = 0.36  # largest share of the window for the controls: names on the map stay readable
@@ -53,7 +53,7 @@ class SplitStudy:
     """Survey of a split's robots."""
 
     audit: Audit
-    members: tuple[tuple[Side, Member], ...]  # members that can be composed, train robots first
+    sound: Sequence[int]  # indices of members that can be composed, train robots first
     matrices: Mapping[str, Array]  # similarity of their pairs by measure, shape (n, n)
 
 
@@ -62,12 +62,17 @@ class SplitPage:
     """A split in one browser."""
 
     session: Session
-    name: str  # name or file of the split, as in the address
     split: Split
     gallery: gallery_page.Gallery
     measure: viser.GuiDropdownHandle[str]
+    map: viser.GuiHtmlHandle
+    audit: viser.GuiHtmlHandle
     study: SplitStudy | None = None
-    texts: dict[str, viser.GuiHtmlHandle] = field(default_factory=dict)
+
+    @property
+    def studied_rows(self) -> list[Row]:
+        """Rows of the robots that can be composed."""
+        return [self.gallery.rows[i] for i in self.study.sound] if self.study else []
 
 
 def show(session: Session) -> None:
@@ -87,14 +92,13 @@ def show(session: Session) -> None:
     tabs = gui.add_tab_group()
     with tabs.add_tab("Robots", viser.Icon.ROBOT):
         gallery_page.add_controls(gallery)
-    texts = {}
     with panel.add_tab("Map", viser.Icon.MAP):
         panel.visible = True  # on a narrow window, too
         measure = gui.add_dropdown("measure", tuple(MEASURES), initial_value="tree")
-        texts["map"] = gui.add_html(markup.framed(markup.dim("the robots are being compared")))
+        similarity_map = gui.add_html(markup.framed(markup.dim("the robots are being compared")))
     with tabs.add_tab("Audit", viser.Icon.STETHOSCOPE):
-        texts["audit"] = gui.add_html("")
-    page = SplitPage(session, name, split, gallery, measure, texts=texts)
+        audit = gui.add_html("")
+    page = SplitPage(session, split, gallery, measure, similarity_map, audit)
     session.on_change(measure, lambda: _draw_map(page))
     session.run_in_background(lambda: _study(page))
 
@@ -126,29 +130,23 @@ def _study(page: SplitPage) -> None:
         lambda: study_split(page.split, folders, session.workers),
         "comparing {} robots",
     )
-    page.texts["audit"].content = markup.framed(audit_text(page.study.audit))
+    page.audit.content = markup.framed(audit_text(page.study.audit))
     _draw_map(page)
-    uris = {member_uri(page.name, side, member) for side, member in page.study.members}
-    gallery_page.load_pictures(page.gallery, [row for row in page.gallery.rows if row.uri in uris])
+    gallery_page.load_pictures(page.gallery, page.studied_rows)
     _draw_map(page)
 
 
 def _draw_map(page: SplitPage) -> None:
-    study = page.study
-    if study is None or not study.members:
+    if page.study is None or not page.study.sound:
         return
     measure = MEASURES[page.measure.value]
-    values = study.matrices[measure.name]
-    names = [member.name for _, member in study.members]
-    sides = [side for side, _ in study.members]
-    uris = [member_uri(page.name, side, member) for side, member in study.members]
-    plane = classical_mds(to_distances(values, measure.name))
-    page.texts["map"].content = markup.framed(
+    plane = classical_mds(to_distances(page.study.matrices[measure.name], measure.name))
+    page.map.content = markup.framed(
         markup.dim(
             f"{measure.meaning}; {plane.kept:.0%} of the variation shown; "
             f"{markup.tag('train', 'train')}{markup.tag('test', 'test')} click a robot"
         ),
-        map_svg(plane.points, names, sides, uris, page.gallery.thumbnails),
+        map_svg(plane.points, page.studied_rows, page.gallery.thumbnails),
     )
 
 
@@ -171,10 +169,9 @@ def conclude_study(
     """Compare measured robots, and audit the split. Runs in a worker."""
     survey = compare_members(split, robots, all_pairs=True)
     sound = [i for i, each in enumerate(survey.robots) if isinstance(each, SurveyedRobot)]
-    members = sided_members(split)
     return SplitStudy(
         audit_survey(survey, Library(folders)),
-        tuple(members[i] for i in sound),
+        sound,
         {
             name: survey.similarity[np.ix_(sound, sound, [k])][..., 0]
             for k, name in enumerate(MEASURES)
@@ -182,13 +179,7 @@ def conclude_study(
     )
 
 
-def map_svg(
-    points: Array,
-    names: Sequence[str],
-    sides: Sequence[str],
-    uris: Sequence[str],
-    pictures: Mapping[str, str],
-) -> str:
+def map_svg(points: Array, robots: Sequence[Row], pictures: Mapping[str, str]) -> str:
     """Return a map of robots at points (n, 2), which show their side; a click opens one."""
     cells = map_cells(points)
     columns, rows = (cells.max(axis=0) + 1).tolist()
@@ -197,18 +188,18 @@ def map_svg(
     height = width * _MAP_CELL[1] / _MAP_CELL[0]
     inner, label = 0.94 * width, min(13.0, 0.13 * width)
     marks = []
-    for (x, y), name, side, uri in zip(cells.tolist(), names, sides, uris, strict=True):
-        query, colour = escape(Address("robot", (uri,)).query), SIDE_COLOURS[side]
+    for (x, y), row in zip(cells.tolist(), robots, strict=True):
+        query, colour = escape(Address("robot", (row.uri,)).query), SIDE_COLOURS[row.role]
         box = f'width="{inner:.1f}" height="{0.75 * inner:.1f}"'
         at = f'x="{x * width:.1f}" y="{y * height:.1f}"'
-        picture = f'<image {at} {box} href="{pictures[uri]}"/>' if pictures.get(uri) else ""
+        picture = f'<image {at} {box} href="{pictures[row.uri]}"/>' if pictures.get(row.uri) else ""
         marks.append(
-            f'<a href="{query}"><g><title>{escape(name)} ({side})</title>'
+            f'<a href="{query}"><g><title>{escape(row.name)} ({row.role})</title>'
             f'<rect class="point" {at} {box} rx="4" fill="#fff"/>{picture}'
             f'<rect {at} {box} rx="4" fill="none" stroke="{colour}" stroke-width="2"/>'
             f'<text x="{x * width + inner / 2:.1f}" text-anchor="middle" font-size="{label:.1f}" '
             f'y="{y * height + 0.75 * inner + 1.1 * label:.1f}" fill="{colour}">'
-            f"{escape(name[:_MAP_LABEL])}</text></g></a>"
+            f"{escape(row.name[:_MAP_LABEL])}</text></g></a>"
         )
     return (
         f'<svg viewBox="0 0 {_MAP_WIDTH:.0f} {rows * height + label:.0f}" width="100%" '

@@ -251,29 +251,14 @@ def fit_camera(points: Array, tangents: Array) -> Array:
 _NEAR = 1e-3  # smallest distance from the camera by which points are divided [m]
 
 
-@dataclass(frozen=True, eq=False)
-class View:
-    """The camera of a browser."""
+def project_points(camera: viser.CameraHandle, points: Array) -> tuple[Array, Array]:
+    """Return where points (..., 3) are in a browser's picture, and depths [m], < 0 behind.
 
-    position: Array  # position in the world, shape (3,) [m]
-    R_world_camera: Array  # axes of the camera in the world: right, down, forward, shape (3, 3)
-    fov: float  # vertical field of view [rad]
-    aspect: float  # width of the picture divided by its height
-
-
-def camera_view(client: viser.ClientHandle) -> View:
-    """Return the camera of a browser."""
-    camera = client.camera
+    Places (..., 2) are shares of its width and height, from the upper left corner.
+    """
     w, x, y, z = camera.wxyz.tolist()
-    rotation = np.array(to_matrix((w, x, y, z)))
-    return View(np.asarray(camera.position), rotation, camera.fov, camera.aspect)
-
-
-def project_points(view: View, points: Array) -> tuple[Array, Array]:
-    """Return where points (..., 3) are in the picture (..., 2), and depths [m], < 0 behind."""
-    local = (points - view.position) @ view.R_world_camera
+    local = (points - camera.position) @ np.array(to_matrix((w, x, y, z)))
     depth = local[..., 2]
-    focal = 0.5 / np.tan(view.fov / 2)
     safe = np.where(np.abs(depth) < _NEAR, _NEAR, depth)
-    middle = np.array([0.5 * view.aspect, 0.5])
-    return focal * local[..., :2] / safe[..., None] + middle, depth
+    sides = 2 * np.tan(camera.fov / 2) * np.array([camera.aspect, 1.0])
+    return local[..., :2] / safe[..., None] / sides + 0.5, depth
