@@ -11,8 +11,8 @@ import shlex
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -45,7 +45,6 @@ class Entry:
     status: Status
     """``absent`` for an optional package, ``error`` if morphgen does not work as documented."""
     text: str  # result, and what to do about it if it is not `ok`; one line
-    data: Mapping[str, object] = field(default_factory=dict)  # values of the text, for programs
 
 
 def diagnose() -> Iterator[tuple[str, Entry]]:
@@ -92,22 +91,21 @@ def attempt(name: str, examine: Callable[[], Entry]) -> Entry:
 
 
 def _morphgen() -> Entry:
-    folder = str(Path(__file__).parent)
+    folder = Path(__file__).parents[1]
     number = importlib.metadata.version("morphgen")
-    return Entry("morphgen", "ok", f"{number} in {folder}", {"version": number, "folder": folder})
+    return Entry("morphgen", "ok", f"{number} in {folder}")
 
 
 def _python() -> Entry:
-    data = {"version": platform.python_version(), "platform": platform.platform()}
-    text = f"{platform.python_implementation()} {data['version']} at {sys.executable}"
-    return Entry("python", "ok", f"{text}, {data['platform']}", data)
+    name = f"{platform.python_implementation()} {platform.python_version()}"
+    return Entry("python", "ok", f"{name} at {sys.executable}, {platform.platform()}")
 
 
 def _cpu() -> Entry:
     total = os.cpu_count() or 1
     usable = usable_cores()
     text = f"{platform.machine()}, {usable} of {total} logical cores may be used"
-    return Entry("cpu", "ok", text, {"machine": platform.machine(), "cores": usable})
+    return Entry("cpu", "ok", text)
 
 
 def _gpu() -> Entry:
@@ -117,12 +115,12 @@ def _gpu() -> Entry:
     if not torch.cuda.is_available():
         build = torch.version.cuda
         why = "torch was built without CUDA" if build is None else f"no device for CUDA {build}"
-        return Entry("gpu", "ok", f"none ({why}); everything runs on the CPU", {"devices": []})
+        return Entry("gpu", "ok", f"none ({why}); everything runs on the CPU")
     names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
     # A device that is listed may lack kernels for its architecture.
     torch.ones(2, device="cuda").sum().item()
     text = f"{', '.join(names)} with CUDA {torch.version.cuda}; --device cuda works"
-    return Entry("gpu", "ok", text, {"devices": names, "cuda": torch.version.cuda})
+    return Entry("gpu", "ok", text)
 
 
 def _cache() -> Entry:
@@ -135,67 +133,37 @@ def _cache() -> Entry:
         for entry in sorted(folder.iterdir() if folder.is_dir() else ())
         if entry.is_dir()
     }
-    data = {"folder": str(folder), "bytes": sizes}
     if not os.access(existing, os.W_OK):
         text = f"{folder} cannot be written: goal sets and fits are made anew each time"
-        return Entry("cache", "warning", text, data)
+        return Entry("cache", "warning", text)
     listed = ", ".join(f"{name} {size / 1e6:.1f} MB" for name, size in sizes.items())
-    return Entry("cache", "ok", f"{folder}: {listed or 'empty'}; delete it to clear it", data)
+    return Entry("cache", "ok", f"{folder}: {listed or 'empty'}; delete it to clear it")
 
 
 def packages() -> Iterator[Entry]:
     """Compare the installed packages with the ranges that morphgen declares."""
     distribution = importlib.metadata.distribution("morphgen")
-    declared = [Requirement(line) for line in distribution.requires or ()]
-    yield from _group("core", _requirements("", declared))
-    for extra in distribution.metadata.get_all("Provides-Extra") or ():
-        if extra not in NOT_FOR_USERS:
-            yield from _group(f"extra {extra}", _requirements(extra, declared))
-
-
-def _requirements(extra: str, declared: Sequence[Requirement]) -> list[Requirement]:
-    """Return the requirements of an extra, and of the extras that it includes."""
-    chosen: dict[str, Requirement] = {}
-    for requirement in declared:
-        marker = requirement.marker
-        if (marker is None) == bool(extra) or (marker and not marker.evaluate({"extra": extra})):
+    extras = distribution.metadata.get_all("Provides-Extra") or ()
+    requirements: dict[str, tuple[str, Requirement]] = {}
+    for extra in ("", *(each for each in extras if each not in NOT_FOR_USERS)):
+        for requirement in map(Requirement, distribution.requires or ()):
+            marker = requirement.marker
+            if marker.evaluate({"extra": extra}) if marker else not extra:
+                requirements.setdefault(requirement.name, (extra, requirement))
+    requirements.pop("morphgen", None)  # extras that include others
+    installed = {}
+    for name, (extra, requirement) in requirements.items():
+        try:
+            installed[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            how = f"pip install 'morphgen[{extra}]'" if extra else "install morphgen again"
+            yield Entry(name, "absent" if extra else "error", f"not installed: {how}")
             continue
-        if requirement.name == "morphgen":
-            for included in sorted(requirement.extras):
-                chosen |= {each.name: each for each in _requirements(included, declared)}
-        else:
-            chosen[requirement.name] = requirement
-    return list(chosen.values())
-
-
-def _group(name: str, requirements: Sequence[Requirement]) -> Iterator[Entry]:
-    """Yield a result for the core or an extra, and one for each package outside its range."""
-    versions = {each.name: _version(each.name) for each in requirements}
-    missing = [package for package, number in versions.items() if number is None]
-    for requirement in requirements:
-        number = versions[requirement.name]
-        if number and not requirement.specifier.contains(number, prereleases=True):
-            text = f"{number} is outside of the range {requirement.specifier} that morphgen needs"
-            yield Entry(f"package {requirement.name}", "warning", text)
-    kind, _, extra = name.partition(" ")
-    if not requirements:
-        yield Entry(name, "absent", "not available for this version of Python")
-    elif missing and kind == "core":
-        text = f"not installed: {', '.join(missing)}; install morphgen again"
-        yield Entry(name, "error", text, versions)
-    elif missing:
-        text = f"not installed: {', '.join(missing)}; pip install 'morphgen[{extra}]'"
-        yield Entry(name, "absent", text, versions)
-    else:
-        text = ", ".join(f"{package} {number}" for package, number in sorted(versions.items()))
-        yield Entry(name, "ok", text, versions)
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
+        if not requirement.specifier.contains(installed[name], prereleases=True):
+            needed = f"the range {requirement.specifier} that morphgen needs"
+            yield Entry(name, "warning", f"{installed[name]} is outside of {needed}")
+    listed = ", ".join(f"{name} {number}" for name, number in sorted(installed.items()))
+    yield Entry("installed", "ok", listed)
 
 
 def _library() -> Entry:
@@ -218,10 +186,9 @@ def _library() -> Entry:
         text += (
             f"; {len(parts.Library([folder]).paths)} of them in {folder} ({parts.LIBRARY_VARIABLE})"
         )
-    data = {"parts": counts, "folders": [str(folder) for folder in library.folders]}
     if faults := library.faults():
         text += f"; left out: {'; '.join(map(str, faults))}"
-    return Entry("library", "warning" if faults else "ok", one_line(text), data)
+    return Entry("library", "warning" if faults else "ok", one_line(text))
 
 
 def _robot_package(package: str) -> Entry:
@@ -244,21 +211,20 @@ def _robot_package(package: str) -> Entry:
             errors.append(str(error))
     if errors:
         text = f"{len(errors)} of {len(parts)} parts lack their file: {errors[0]}"
-        return Entry(name, "error", text, {"errors": errors})
+        return Entry(name, "error", text)
     stored, number = stored_facts(), importlib.metadata.version(package)
     changed = [
         manifest.name
         for manifest, _ in parts
         if stored.get(manifest.name, {}).get("digest") != source_digest(manifest)
     ]
-    data = {"version": number, "parts": len(parts), "changed": changed}
     if changed:
         text = (
             f"{len(changed)} of {len(parts)} parts are not those that this morphgen was tested "
             f"with: {package} {number} is another version, or their YAML files were changed"
         )
-        return Entry(name, "warning", text, data)
-    return Entry(name, "ok", f"{number}, with the files of {len(parts)} parts", data)
+        return Entry(name, "warning", text)
+    return Entry(name, "ok", f"{number}, with the files of {len(parts)} parts")
 
 
 def demo(args: argparse.Namespace) -> int:
