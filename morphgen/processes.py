@@ -97,7 +97,7 @@ def _in_processes(
     work: Callable[[T], R], chunks: Iterable[Sequence[T]], jobs: int, ahead: Callable[[], int]
 ) -> Generator[R, None, None]:
     """Yield the results of chunks; ``ahead`` returns how many chunks should be submitted."""
-    context = get_context("spawn")  # fork would copy the locks that threads of torch or tqdm hold
+    context = get_context("spawn")  # fork would copy the locks that threads of torch hold
     stopped = context.RawValue("b", 0)
     pool = ProcessPoolExecutor(jobs, context, _init_map_worker, (pickle.dumps(work), stopped))
     waiting = iter(chunks)

@@ -82,7 +82,7 @@ class Command:
                 condition = f"{preposition} {name} {choices}".rstrip()
                 raise MorphgenError(f"{' '.join(idle)}: only {condition}")
         module, _, function = self.function.rpartition(".")
-        from morphgen.cli.progress import status  # loads tqdm, which a help does not need
+        from morphgen.cli.progress import status
 
         # Packages, which take seconds; in a pipe the work itself says what it is.
         with status(args, "loading") if sys.stderr.isatty() else nullcontext():

@@ -1,24 +1,24 @@
-"""Progress of commands on stderr: bars on a terminal, lines at intervals elsewhere."""
+"""Progress of commands on stderr: a line that is redrawn on a terminal, several elsewhere."""
 
 from __future__ import annotations
 
 import argparse
 import math
+import shutil
 import sys
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from functools import partial
-from typing import IO, TYPE_CHECKING, NoReturn, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
+from morphgen.errors import shortened
 from morphgen.progress import Progress, raise_if_interrupted, show_progress
 from morphgen.tasks.registry import TASKS
 
-if TYPE_CHECKING:  # tqdm is loaded when a bar is drawn
-    from tqdm import tqdm
-
+if TYPE_CHECKING:
     from morphgen.rl.ppo import UpdateMetrics
     from morphgen.rl.runs.training import ShowMetrics, Subrun
 
@@ -26,8 +26,8 @@ T = TypeVar("T")
 
 FIRST_LINE = 2.0  # time after which a line says what is done, where there is no terminal [s]
 LINE_INTERVAL = 10.0  # time between two further lines [s]
-REDRAW_INTERVAL = 1.0
-"""Time after which a bar appears, and between its updates if nothing else happens [s]."""
+REDRAW_INTERVAL = 1.0  # time after which a line appears on a terminal, and is drawn again [s]
+ERASE = "\r\x1b[K"  # what removes it
 
 
 @contextmanager
@@ -84,68 +84,35 @@ class _StagedBar:
 
 @contextmanager
 def _bar(
-    args: argparse.Namespace | None,
-    title: str,
-    unit: str = "robot",
-    total: int | None = None,
-    layout: str | None = None,
-    delay: float = REDRAW_INTERVAL,
+    args: argparse.Namespace | None, title: str, unit: str = "robot", total: int | None = None
 ) -> Iterator[Progress]:
-    """Yield the function that sets a bar, which disappears at the end.
+    """Yield the function that counts what is done, which is shown if the work takes long.
 
-    Without a terminal there are lines instead; nothing is shown with ``--json``.
-
-    delay: Time before the bar appears, so that quick commands do not flicker [s].
+    On a terminal a line is redrawn, and removed at the end; elsewhere there is one now and then.
+    Nothing is shown with ``--json``.
     """
     raise_if_interrupted()
     if getattr(args, "json", False):
         yield lambda done, total: raise_if_interrupted()
         return
-    if not sys.stderr.isatty():
-        with _lines(title, unit, total) as print_progress:
-            yield print_progress
-        return
-    from tqdm import tqdm
-
-    shown: tqdm[NoReturn] = tqdm(
-        desc=title,
-        unit=f" {unit}",
-        total=total,
-        bar_format=None if total is None else layout,
-        file=sys.stderr,
-        delay=delay,
-        leave=False,
-    )
-
-    def show(done: float, total: int | None) -> None:
-        raise_if_interrupted()
-        if total is not None:
-            shown.total, shown.bar_format = total, layout
-        shown.update(done - shown.n)  # tqdm counts steps, reports are sums
-
-    with shown:
-        try:
-            with _repeated(shown.refresh):
-                yield show
-        finally:
-            shown.clear()  # closing it would not: tqdm takes a bar for hidden that others redrew
-
-
-@contextmanager
-def _lines(title: str, unit: str, total: int | None) -> Iterator[Progress]:
-    """Yield the function that counts what is done; lines tell it if the work takes long."""
-    begin = time.monotonic()
-    counted, due, lock = 0.0, begin + FIRST_LINE, threading.Lock()
+    on_terminal, begin = sys.stderr.isatty(), time.monotonic()
+    first, interval = (REDRAW_INTERVAL,) * 2 if on_terminal else (FIRST_LINE, LINE_INTERVAL)
+    counted, due, lock = 0.0, begin + first, threading.Lock()
 
     def tell() -> None:
         nonlocal due
         with lock:
             if (now := time.monotonic()) < due:
                 return
-            due = now + LINE_INTERVAL
+            due = now + interval
         of = "" if total is None else f" of {total}"
         count = f": {counted:.0f}{of} {unit}s" if counted or total else ""
-        note(f"{title}{count}, {now - begin:.0f} s")
+        left = (now - begin) * (total / counted - 1) if total and counted else 0
+        text = f"{title}{count}, {now - begin:.0f} s" + (f", {left:.0f} s left" if left else "")
+        if on_terminal:
+            _draw(text)
+        else:
+            note(text)
 
     def show(done: float, new_total: int | None) -> None:
         nonlocal counted, total
@@ -153,8 +120,11 @@ def _lines(title: str, unit: str, total: int | None) -> Iterator[Progress]:
         counted, total = done, total if new_total is None else new_total
         tell()
 
-    with _repeated(tell):
-        yield show
+    try:
+        with _repeated(tell):
+            yield show
+    finally:
+        _erase()
 
 
 @contextmanager
@@ -188,29 +158,37 @@ def track(
 
 def note(text: str) -> None:
     """Print a line that is no part of the command's result, which alone goes to stdout."""
-    with _above_bars(sys.stderr):
-        print(text, file=sys.stderr, flush=True)
+    _erase()
+    print(text, file=sys.stderr, flush=True)
 
 
 def print_line(line: str) -> None:
-    """Print a line above the bars that are shown."""
-    with _above_bars(sys.stdout):
-        print(line, flush=True)
+    """Print a line above the one that is redrawn."""
+    _erase()
+    print(line, flush=True)
 
 
-def _above_bars(stream: IO[str]) -> AbstractContextManager[None]:
-    """Return a block in which lines can be printed above the bars that are shown."""
-    if "tqdm" not in sys.modules:
-        return nullcontext()
-    from tqdm import tqdm
+_is_drawn = False  # whether a line stands on the terminal
 
-    return tqdm.external_write_mode(file=stream)
+
+def _draw(text: str) -> None:
+    global _is_drawn
+    width = shutil.get_terminal_size().columns - 1  # a full line would begin another one
+    print(f"{ERASE}{shortened(text, width)}", end="", file=sys.stderr, flush=True)
+    _is_drawn = True
+
+
+def _erase() -> None:
+    global _is_drawn
+    if _is_drawn:
+        print(ERASE, end="", file=sys.stderr, flush=True)
+    _is_drawn = False
 
 
 @contextmanager
 def status(args: argparse.Namespace | None, text: str) -> Iterator[None]:
     """Show on a terminal what the command does and for how long, until the work is done."""
-    with _bar(args, text, layout="{desc} [{elapsed}]"):
+    with _bar(args, text):
         yield
 
 
@@ -234,11 +212,8 @@ class TrainingProgress(_StagedBar):
     """Shows goal sets, trainings and evaluations, one after the other."""
 
     def __init__(self) -> None:
-        layout = "{l_bar}{bar}| {n:.1f}/{total_fmt} [{elapsed}<{remaining}]"
         super().__init__(
-            partial(_bar, None, layout=layout, delay=0),
-            "episode",
-            partial(_bar, None, "preparing", "goal set"),
+            partial(_bar, None), "episode", partial(_bar, None, "preparing", "goal set")
         )
 
     def training(self, subrun: Subrun) -> ShowMetrics:
