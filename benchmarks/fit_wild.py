@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections import Counter
 from importlib.metadata import files
 from pathlib import Path
@@ -96,7 +97,10 @@ def _measure(named: tuple[str, tuple[Shape, ...]]) -> Row | str:
     name, shapes = named
     try:
         solid = solid_of(shapes)
-        one, several = (fit_solid(solid, FitOptions(max_primitives=k)) for k in (1, 4))
+        one = fit_solid(solid, FitOptions(max_primitives=1))
+        start = time.perf_counter()
+        several = fit_solid(solid, FitOptions(max_primitives=4))
+        seconds = time.perf_counter() - start
     except MorphgenError as error:
         return f"{name}: {error}"
     low, high = solid.mesh.bounds
@@ -110,7 +114,7 @@ def _measure(named: tuple[str, tuple[Shape, ...]]) -> Row | str:
         len(several.primitives),
         filled,
         filled * float(np.prod(high - low) / solid.hull.volume),
-        several.seconds,
+        seconds,
     )
 
 

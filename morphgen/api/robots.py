@@ -38,8 +38,8 @@ from morphgen.grammar.request import parse_words
 from morphgen.grammar.robot_source import RobotLike, is_one_robot, resolve_robot, robot_list
 from morphgen.grammar.sampling import SamplingError, sample_robots
 from morphgen.grammar.values import parse_conditions
-from morphgen.model.geometry import MESH_SUFFIXES, Mesh, Shape
-from morphgen.model.robot import Link, Robot
+from morphgen.model.geometry import MESH_SUFFIXES
+from morphgen.model.robot import Robot
 from morphgen.typing import Array
 
 if TYPE_CHECKING:
@@ -238,18 +238,17 @@ def fit(
         which is made at the first access.
 
     Raises:
-        FitError: If an argument is out of its range, or no link has a shape.
+        FitError: If an argument is out of its range, or no link has a shape with a volume.
         MissingDependencyError: If the extra ``fit`` is not installed.
         MorphgenError: If the robot cannot be composed or read.
     """
     from morphgen.fitting.link_fit import FitOptions
-    from morphgen.fitting.replace_collision import fit_robot
+    from morphgen.fitting.replace_collision import fit_robot, mesh_robot
 
     options = FitOptions(max_primitives, iou, seed, spheres, cover)
     parts = default_library(library)
     if isinstance(robot, str | PathLike) and Path(robot).suffix.lower() in MESH_SUFFIXES:
-        path = Path(robot)
-        robot = Robot(path.stem, (Link(path.stem, collisions=(Shape(Mesh(path)),)),), ())
+        robot = mesh_robot(Path(robot))
     target = resolve_robot(robot, parts)
     return fit_robot(target, options, parts.folders, jobs=jobs)
 

@@ -12,15 +12,15 @@ from typing import TypeAlias
 
 from morphgen.checks import check
 from morphgen.cli import options as opt
-from morphgen.cli.progress import bar, print_line, status, track
-from morphgen.errors import FitError, FormatError, MorphgenError
-from morphgen.fitting.link_fit import FitOptions, LinkFit, Quality, fit_shapes
-from morphgen.fitting.replace_collision import fit_robot
+from morphgen.cli.progress import bar, print_line, track
+from morphgen.errors import FormatError, MorphgenError
+from morphgen.fitting.link_fit import FitOptions, LinkFit, Quality
+from morphgen.fitting.replace_collision import fit_robot, mesh_robot
 from morphgen.fitting.robot_fit import FitReport, parts_with_meshes, store_parts
 from morphgen.formats.bundle import bundle_folder, require_replaceable, write_bundle
 from morphgen.grammar.part import load_part
 from morphgen.grammar.robot_source import RobotReference, is_robot_file
-from morphgen.model.geometry import MESH_SUFFIXES, Mesh, Shape
+from morphgen.model.geometry import MESH_SUFFIXES
 from morphgen.model.robot import Robot
 from morphgen.tables import table
 
@@ -37,13 +37,12 @@ COLUMNS = {
     "gap mm": ".1f",
     "gap p95": ".1f",
     "Hausdorff mm": ".1f",
-    "s": ".1f",
 }
 """Headers of the table of fits, and how their numbers are written."""
 
 
 Target: TypeAlias = tuple[RobotReference | None, Robot]
-"""A robot to which primitives are fitted, and where it is from; None for a part alone."""
+"""A robot to which primitives are fitted, and where it is from; None for a part or a mesh alone."""
 
 
 def fit(args: argparse.Namespace) -> None:
@@ -55,9 +54,6 @@ def fit(args: argparse.Namespace) -> None:
         parts = parts_with_meshes(opt.library_of(args), missing=args.missing)
         for path in track(store_parts(parts, jobs=args.jobs), args, "fitting", "part", len(parts)):
             print_line(str(path))
-        return
-    if len(args.words) == 1 and Path(args.words[0]).suffix.lower() in MESH_SUFFIXES:
-        _fit_mesh(args, options)
         return
     targets = _targets(args)
     if args.out:
@@ -85,34 +81,16 @@ def _require_own_names(targets: Sequence[Target]) -> None:
             )
 
 
-def _fit_mesh(args: argparse.Namespace, options: FitOptions) -> None:
-    path = Path(args.words[0])
-    if args.out:
-        raise MorphgenError(f"--out writes a robot, and {path} is a mesh; use --json")
-    try:
-        with status(args, f"fitting {path}"):
-            fit = fit_shapes([Shape(Mesh(path))], options)
-    except FitError as error:
-        raise MorphgenError(f"{path}: {error}") from error
-
-    def text() -> str:
-        primitives = [
-            f"{shape.geometry} at {pose.position}, quaternion {pose.quaternion}"
-            for shape in fit.primitives
-            if (pose := shape.T_link_shape)
-        ]
-        return "\n".join([_table([_row(path.name, fit)]), *primitives])
-
-    opt.print_result(args, {"mesh": str(path), **fit.as_dict()}, text)
-
-
 def _targets(args: argparse.Namespace) -> list[Target]:
-    """Return what the arguments name: a part, or robots."""
+    """Return what the arguments name: a part, a mesh file, or robots."""
     library = opt.library_of(args)
     word = args.words[0]
-    if len(args.words) == 1 and word in library.paths and not is_robot_file(word):
+    is_mesh = Path(word).suffix.lower() in MESH_SUFFIXES
+    if len(args.words) == 1 and (is_mesh or (word in library.paths and not is_robot_file(word))):
         if args.root is not None:
             raise MorphgenError(f"--root {args.root}: only with a bundle or a description")
+        if is_mesh:
+            return [(None, mesh_robot(Path(word)))]
         return [(None, load_part(library.manifest(word)).fragment)]
     return list(opt.read_robots(args))
 
@@ -157,8 +135,7 @@ def _fit_robot(
 def _report_text(report: FitReport) -> str:
     rows = [_row(row.link, row.fit, row.same_as) for row in report.links]
     if report.mean is not None:
-        seconds = sum(row.fit.seconds for row in report.links)
-        rows.append(("mean", "", "", *_quality_cells(report.mean), seconds))
+        rows.append(("mean", "", "", *_quality_cells(report.mean)))
     return "\n".join([_table(rows), *map(opt.finding_line, report.findings)])
 
 
@@ -170,7 +147,7 @@ def _row(link: str, fit: LinkFit, same_as: str | None = None) -> tuple[object, .
     kinds = Counter(type(shape.geometry).__name__.lower() for shape in fit.primitives)
     named = ", ".join(f"{n} {kind}" if n > 1 else kind for kind, n in sorted(kinds.items()))
     solid = f"as {same_as}" if same_as else fit.solid
-    return (link, named, solid, *_quality_cells(fit.quality), fit.seconds)
+    return (link, named, solid, *_quality_cells(fit.quality))
 
 
 def _quality_cells(quality: Quality) -> tuple[float, ...]:

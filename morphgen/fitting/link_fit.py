@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
@@ -61,7 +60,6 @@ class LinkFit:
     single: Shape | None  # the single primitive of largest overlap; None if it was not searched for
     solid: str  # how the solid was made, see `solid.Method`; `primitives` if the shapes were kept
     quality: Quality
-    seconds: float  # duration of the fit [s]; 0 for a link that shares the fit of another
     decimated_from: int | None = None
     """Number of triangles before decimation; None if the mesh was not decimated."""
 
@@ -72,7 +70,6 @@ class LinkFit:
             "solid": self.solid,
             "decimated_from": self.decimated_from,
             "quality": {name: float(f"{v:.6g}") for name, v in asdict(self.quality).items()},
-            "seconds": round(self.seconds, 2),
         }
 
 
@@ -80,7 +77,6 @@ def fit_shapes(
     shapes: Sequence[Shape], options: FitOptions, *, solid: Solid | None = None
 ) -> LinkFit:
     """Fit the shapes of one link in its frame, or keep few primitives of the wanted kinds."""
-    start = time.perf_counter()
     solid = solid or solid_of(shapes)
     is_kept = are_primitives(shapes) and len(shapes) <= options.max_primitives
     if options.spheres is not None:
@@ -88,17 +84,16 @@ def fit_shapes(
     if is_kept:
         kept = tuple(replace(shape, rgba=None) for shape in shapes)
         single = kept[0] if len(kept) == 1 else None
-        return replace(_measure(kept, single, solid, start), solid="primitives")
+        return replace(_measure(kept, single, solid), solid="primitives")
     return fit_solid(solid, options)
 
 
 def fit_solid(solid: Solid, options: FitOptions) -> LinkFit:
     """Fit a solid; see ``fit_shapes``."""
-    start = time.perf_counter()
     target = search.sample_solid(solid, options.seed)
     if options.spheres is not None:
         found = search.best_spheres(target, options.spheres, options.cover, options.seed)
-        return _measure(found.shapes, None, solid, start)
+        return _measure(found.shapes, None, solid)
     best = latest = search.best_single(target)
     (single,) = best.shapes
     for _ in range(1, options.max_primitives):
@@ -109,15 +104,12 @@ def fit_solid(solid: Solid, options: FitOptions) -> LinkFit:
             break
         latest = more
         best = max(best, latest, key=lambda result: result.iou)
-    return _measure(best.shapes, single, solid, start)
+    return _measure(best.shapes, single, solid)
 
 
-def _measure(
-    primitives: tuple[Shape, ...], single: Shape | None, solid: Solid, start: float
-) -> LinkFit:
-    seconds = time.perf_counter() - start  # of the fit, without the measurement
+def _measure(primitives: tuple[Shape, ...], single: Shape | None, solid: Solid) -> LinkFit:
     measured = quality(solid, primitives)
-    return LinkFit(primitives, single, solid.method, measured, seconds, solid.decimated_from)
+    return LinkFit(primitives, single, solid.method, measured, solid.decimated_from)
 
 
 SolidPrimitive = Box | Cylinder | Capsule  # a primitive; a sphere is a capsule of length 0

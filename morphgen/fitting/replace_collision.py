@@ -259,7 +259,7 @@ class FittedRobot:
     def robot(self) -> Robot:
         """The same robot with the primitives as its collision shapes, made at the first access.
 
-        Its provenance has the report without durations.
+        Its provenance has the report.
 
         Raises:
             MeshError: If a mesh cannot be read.
@@ -270,8 +270,13 @@ class FittedRobot:
         primitives = {row.link: row.fit.primitives for row in self.report.links}
         fits = fits_of(self.source, self.report, read_stored_fits(self.folders))
         fitted = with_fits(with_primitives(self.source, primitives), fits)
-        provenance = {**self.source.provenance, "primitives": self.report.without_times()}
+        provenance = {**self.source.provenance, "primitives": self.report.as_dict()}
         return replace(fitted, provenance=provenance)
+
+
+def mesh_robot(path: Path) -> Robot:
+    """Return a robot of one link with a mesh file as its shape."""
+    return Robot(path.stem, (Link(path.stem, collisions=(Shape(Mesh(path)),)),), ())
 
 
 def fit_robot(
@@ -283,6 +288,10 @@ def fit_robot(
     if not any(link.solid_shapes for link in robot.links):
         raise FitError(f"robot {robot.name!r}: no link has a shape")
     report = fit_links(robot, options, jobs=jobs)
+    if not report.links:
+        raise FitError(
+            f"robot {robot.name!r}: {report.findings[0].where}: {report.findings[0].why}"
+        )
     return FittedRobot(robot, report, folders)
 
 

@@ -6,7 +6,6 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
@@ -59,15 +58,8 @@ class FitReport:
         means = {name: float(np.mean(column)) for name, column in values.items()}
         return Quality(**means | {"hausdorff": max(values["hausdorff"])})
 
-    def without_times(self) -> dict[str, object]:
-        """Return plain data for a bundle's card: equal for the same robot, options and seed."""
-        data = self.as_dict()
-        for link in cast(list[dict[str, object]], data["links"]):
-            del link["seconds"]
-        return data
-
     def as_dict(self) -> dict[str, object]:
-        """Return plain data for JSON."""
+        """Return plain data for JSON: equal for the same robot, options and seed."""
         options = self.options
         of_spheres, of_primitives = ("spheres", "cover"), ("max_primitives", "iou")
         names = of_primitives if options.spheres is None else of_spheres
@@ -116,7 +108,7 @@ def fit_links(
         elif link is first:
             reports.append(LinkReport(link.name, fit))
         else:
-            reports.append(LinkReport(link.name, replace(fit, seconds=0.0), first.name))
+            reports.append(LinkReport(link.name, fit, first.name))
     findings = []
     for link in links:
         where, solid = f"link {link.name}", solids.get(link.name)
