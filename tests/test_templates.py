@@ -70,19 +70,6 @@ def test_cartpole_pole_inertia_matches_its_shapes(values):
     assert pole.inertial.inertia == pytest.approx(solid.inertia, rel=1e-6, abs=1e-9)
 
 
-@pytest.mark.parametrize("fingers", [2, 3, 4, 5])
-@pytest.mark.parametrize("gather", [0.0, 1.0])
-def test_hand_fingers_do_not_collide(fingers, gather):
-    part = load_part(LIBRARY.manifest("hand"), {"fingers": fingers, "gather": gather})
-    names = [link.name for link in part.fragment.links if link.name.endswith("proximal")]
-    assert len(names) == fingers
-    T_root_link = forward_kinematics(part.fragment, part.fragment.home)
-    outwards = np.array([T_root_link[part.fragment.link_index[name], :3, 0] for name in names])
-    cosines = (outwards @ outwards.T)[np.triu_indices(fingers, 1)]
-    widest = np.pi / 4 if gather and fingers > 2 else 2 * np.pi / fingers
-    assert cosines.max() == pytest.approx(np.cos(widest))
-
-
 def test_hand_fingers_curl_towards_the_tool():
     body = load_part(LIBRARY.manifest("hand")).fragment
     open_hand, fist = forward_kinematics(body, [np.zeros(body.dof), np.full(body.dof, 0.5)])

@@ -27,21 +27,15 @@ WAIT = 120_000
 
 
 @pytest.fixture(scope="session")
-def browser_command():
-    """Return the installed browser and its options."""
+def chromium():
+    """A shared browser; every test opens its own pages."""
     path = next(filter(None, map(shutil.which, BROWSERS)), None)
     if path is None:
         pytest.skip("there is no chromium (apt-get install chromium)")
-    return [path, *SOFTWARE_GL, *(() if os.geteuid() else ("--no-sandbox",))]
-
-
-@pytest.fixture(scope="session")
-def chromium(browser_command):
-    """A shared browser; every test opens its own pages."""
     playwright = pytest.importorskip(
         "playwright.sync_api", reason="playwright is not installed (pip install playwright)"
     )
-    path, *options = browser_command
+    options = [*SOFTWARE_GL, *(() if os.geteuid() else ("--no-sandbox",))]
     with playwright.sync_playwright() as started:
         browser = started.chromium.launch(executable_path=path, args=options)
         yield browser

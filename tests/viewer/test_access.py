@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from websockets.datastructures import Headers
 from websockets.exceptions import InvalidStatus
@@ -29,7 +29,7 @@ from morphgen.viewer.app import address as addresses
 from morphgen.viewer.app import server
 from morphgen.viewer.app.address import PAGES, Address, AddressError, parse_address
 from morphgen.viewer.app.app import start_address
-from morphgen.viewer.app.server import AccessPolicy, access_policy, message_fault, refusal_reason
+from morphgen.viewer.app.server import AccessPolicy, access_policy, refusal_reason
 from morphgen.viewer.robot_uri import FileAccess, UriError, read_robot_uri
 
 HUB = "https://hub.example.com"
@@ -210,6 +210,7 @@ RECTANGLE |= {"ray_origin": None, "ray_direction": None, "screen_pos": [[0.1, 0.
         {"type": "RunJavascriptMessage", "source": "alert()"},
         {"type": "GuiUpdateMessage", "uuid": 3, "updates": {}},
         {**RECTANGLE, "screen_pos": [[0.5, 0.5]]},
+        {**RECTANGLE, "event_type": "click", "screen_pos": [[0.5, 0.5]]},  # no page takes it
         {"type": "GuiUpdateMessage", "uuid": "x", "updates": {}, "more": 1},
         {"type": "GuiUpdateMessage", "uuid": "x"},
         {**CAMERA, "wxyz": [1.0, 0.0]},
@@ -233,21 +234,6 @@ def test_a_text_message_closes_its_connection(shared_viewer):
         client.shows("Grammars")  # a closed connection has no page to open
         client.websocket.send("text")
         assert client.until_closed() == (1008, "expected a binary message")
-
-
-@pytest.mark.parametrize(
-    ("message", "fault"),
-    [
-        (CAMERA, ""),
-        (RECTANGLE, ""),
-        (
-            {**RECTANGLE, "event_type": "click", "screen_pos": [[0.5, 0.5]]},
-            "expected a rectangle with two points",
-        ),
-    ],
-)
-def test_the_scene_takes_cameras_and_rectangles_but_no_clicks(message, fault):
-    assert message_fault(msgspec.msgpack.encode(message)) == fault
 
 
 @pytest.mark.parametrize(
@@ -295,20 +281,15 @@ KEYS = st.from_regex(r"[a-z][a-z_ ]{0,8}", fullmatch=True)
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=20)
 
 
-@pytest.mark.slow
+@settings(max_examples=50)
 @given(
     st.sampled_from(tuple(PAGES)),
     st.lists(TEXTS, min_size=1, max_size=4),
-    st.dictionaries(KEYS.filter(lambda key: key not in PAGES), TEXTS.filter(bool)),
+    st.lists(TEXTS, max_size=3),
+    st.dictionaries(KEYS.filter(lambda key: key not in PAGES), TEXTS.filter(bool), max_size=3),
 )
-def test_formatted_url_is_parsed_back(page, subjects, state):
-    address = Address(page, tuple(subjects), state)
-    assert parse_address(address.query) == address
-
-
-@given(st.lists(TEXTS, max_size=3), st.dictionaries(st.just("seed"), TEXTS.filter(bool)))
-def test_robots_of_a_rollout_url_keep_their_order(robots, state):
-    address = Address("play", ("reach",), state, tuple(robots))
+def test_formatted_url_is_parsed_back(page, subjects, robots, state):
+    address = Address(page, tuple(subjects), state, tuple(robots) if page == "play" else ())
     assert parse_address(address.query) == address
 
 
@@ -427,15 +408,6 @@ def test_robots_are_read(opened, uri, name):
     robot = read_robot_uri(uri, opened)
     assert robot.name.startswith(name)
     assert robot.dof > 0
-
-
-@pytest.mark.parametrize(
-    "uri",
-    ["../x", "/etc/passwd", "upload:../../etc/passwd", "robots/../../x", "upload:/etc/hostname"],
-)
-def test_files_outside_are_not_read(opened, uri):
-    with pytest.raises(UriError, match="outside of the folders"):
-        read_robot_uri(uri, opened)
 
 
 @pytest.mark.parametrize(
@@ -578,6 +550,7 @@ def secret(tmp_path):
         "?robot=upload:{}/a.urdf",
         "?robot=upload:..",
         "?gallery={}",
+        "?population={}",
         "?split={}/a.yaml",
         "?split={}",
         "?compare={}/a.urdf&compare={}/a.grammar",

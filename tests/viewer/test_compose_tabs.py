@@ -93,23 +93,6 @@ def test_every_parameter_has_a_slider_with_its_range(shared_viewer):
         client.shows('"?compose=base=pedestal%20arm=arm3"')  # the default
 
 
-TEMPLATES = [
-    manifest
-    for kind in ("base", "arm", "ee")
-    for manifest in LIBRARY.manifests(kind)
-    if manifest.is_template and manifest.name != "none"
-]
-
-
-@pytest.mark.parametrize("manifest", TEMPLATES, ids=lambda manifest: manifest.name)
-def test_every_part_accepts_both_ends_of_every_control(manifest):
-    name, slot = manifest.name, manifest.kind
-    words = f"{slot}={name}" + (" ee=stick" if slot == "base" else "")
-    for key, parameter in pages.parameters_of(slot, name, LIBRARY).items():
-        for value in (parameter.minimum, parameter.maximum):
-            parse_words(changed(words, f"{slot}.{key}", str(value)).split(), LIBRARY)
-
-
 def test_changing_a_part_resets_its_parameters():
     other = changed(WORDS, "left.ee", "stick").split()
     assert "base.height=0.7" in other

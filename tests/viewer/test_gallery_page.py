@@ -1,7 +1,6 @@
 """Galleries and populations of robots, comparisons, and splits."""
 
 import re
-import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -33,7 +32,7 @@ from morphgen.viewer.pages.population import (
 )
 from morphgen.viewer.pages.split import map_svg
 from morphgen.viewer.robot_rows import Row
-from morphgen.viewer.robot_uri import FileAccess, UriError, member_uri, read_robot_uri
+from morphgen.viewer.robot_uri import member_uri, read_robot_uri
 from morphgen.viewer.scene import population as populations
 from morphgen.viewer.scene.population import (
     ReadRobot,
@@ -286,18 +285,6 @@ def test_folders_and_splits_are_populations(files):
     assert len(find_source(split, files).rows) == 12
 
 
-@pytest.mark.parametrize(
-    ("subject", "message"),
-    [
-        ("../..", "outside"),
-        ("nowhere", "no such file"),
-    ],
-)
-def test_what_is_not_a_population_is_named(files, subject, message):
-    with pytest.raises(UriError, match=message):
-        find_source(subject, files)
-
-
 def test_broken_robots_are_reported_with_their_reason(files):
     rows = find_source("robots", files).rows
     results = read_robots(rows, files)
@@ -306,16 +293,6 @@ def test_broken_robots_are_reported_with_their_reason(files):
     assert name == "broken"
     assert "lost" in error
     assert read["some-arm"].row.reach is not None
-
-
-def test_the_key_of_a_population_changes_with_its_files(folder, tmp_path):
-    shutil.copytree(folder / "robots" / "some-arm", tmp_path / "some-arm")
-    files = FileAccess((), (tmp_path,), tmp_path / "none")
-    before = find_source(".", files)
-    assert find_source(".", files) == before
-    urdf = tmp_path / "some-arm" / "robot.urdf"
-    urdf.write_text(urdf.read_text() + "\n")
-    assert find_source(".", files) != before
 
 
 @pytest.mark.slow

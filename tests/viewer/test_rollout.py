@@ -24,7 +24,6 @@ from morphgen.grammar.library import default_library
 from morphgen.rl.baselines import baselines_for
 from morphgen.rl.inference import make_env_and_controller, play, read_controller
 from morphgen.rl.runs.training import train
-from morphgen.tasks.registry import TASKS
 from morphgen.viewer import rollout, simulation
 from morphgen.viewer.app.address import AddressError, parse_address
 from morphgen.viewer.app.workers import SharedResults, WorkerDied, Workers
@@ -459,18 +458,6 @@ def test_curves_are_finite_before_the_first_step():
     for data in curves(played_episode(0, 0), 0):
         assert all(np.isfinite(line).all() for line in data)
         assert {len(line) for line in data} == {3}
-
-
-@pytest.mark.slow
-def test_an_episode_has_curves_under_the_time_slider(see):
-    page = see("?play=reach&robot=robots/some-arm&policy=jacobian")
-    page.get_by_text(f"m from {TASKS['reach'].target}").first.wait_for()
-    page.locator(".uplot canvas").nth(1).wait_for()
-    page.wait_for_function(
-        "Object.values(window.__viserTestpoints?.uplots ?? {}).some("
-        "(plot) => plot.chart.data[0].length > 50)"
-    )
-    assert page.failures == []
 
 
 @pytest.fixture

@@ -20,7 +20,6 @@ import numpy as np
 import pytest
 import zstandard
 from PIL import Image
-from scipy.ndimage import median_filter
 
 import morphgen.viewer
 from helpers.pages import wait_until
@@ -28,13 +27,8 @@ from helpers.robots import arm
 from helpers.viser_client import PlainClient
 from morphgen.cli import build_parser
 from morphgen.formats.bundle import write_bundle
-from morphgen.grammar.compose import compose
-from morphgen.grammar.library import default_library
-from morphgen.grammar.request import parse_request
 from morphgen.model.kinematics import joint_limits
 from morphgen.tasks import renderer
-from morphgen.tasks.renderer import Renderer, RenderState
-from morphgen.tasks.sim.base import Scene
 from morphgen.viewer import robot_files
 from morphgen.viewer.app.address import MAX_CHOSEN, Address, parse_address
 from morphgen.viewer.app.frame import page_links, shown_address, tray_html
@@ -100,18 +94,6 @@ def test_a_joint_moves_from_home_to_both_limits_and_back(column):
     assert values.min() == pytest.approx(low, abs=0.03 * (high - low))
     assert values.max() == pytest.approx(high, abs=0.03 * (high - low))
     assert values.argmin() < values.argmax()
-
-
-def test_the_ground_has_no_dark_dots_at_the_sides_of_a_picture():
-    derivation = parse_request(["base=gantry", "ee=cube"], default_library())
-    robot = compose(derivation, default_library(), "gantry")
-    home = np.array([robot.home])
-    drawn = Renderer(Scene(robot), (), home, robot_files._ring(robot), (480, 360))
-    frame = drawn.frame(RenderState(home[0]), 75).astype(int).sum(axis=2)
-    drawn.close()
-    darker = median_filter(frame, 5) - frame
-    assert (darker[:, :40] <= 40).all()
-    assert (darker[:, -40:] <= 40).all()
 
 
 def test_a_turntable_is_a_video_of_one_turn(monkeypatch, tmp_path):
@@ -353,64 +335,23 @@ def test_every_command_in_the_viewers_texts_exists():
             assert verb in {*known, *PROSE}, f"{path.name}: morphgen {verb}"
 
 
-GROWTH = 1.05
-"""Largest accepted ratio of the memory after a second crowd to the memory after the first."""
-
-
 def robot_name(i):
     return f"prims-{i % 30:06d}"
 
 
-def robot_query(i):
-    return f"?robot=robots/prims/{robot_name(i)}"
-
-
-def session_threads():
-    return [t.name for t in threading.enumerate() if t.name.startswith("morphgen-")]
-
-
-def resident():
-    """Return the resident memory of this process [pages]."""
-    return int(Path("/proc/self/statm").read_text().split()[1])
-
-
-def crowd(on, n, check=lambda: None):
-    """Connect clients, each to the page of another robot; return weak references to sessions."""
+@pytest.mark.slow
+def test_thirty_clients_see_their_own_pages_and_leave_nothing(viewer, capfd):
+    on = viewer()
     with contextlib.ExitStack() as stack:
-        clients = [stack.enter_context(PlainClient(on.port, robot_query(i))) for i in range(n)]
+        queries = [f"?robot=robots/prims/{robot_name(i)}" for i in range(30)]
+        clients = [stack.enter_context(PlainClient(on.port, query)) for query in queries]
         for i, client in enumerate(clients):
             client.shows(f"<h3>{robot_name(i)}</h3>")
-            client.until(lambda client=client: "no self-collision" in client.text)
+            client.shows("no self-collision")
             assert f"<h3>{robot_name(i + 1)}</h3>" not in client.text
-        check()
-        return [weakref.ref(session) for session in on.sessions.values()]
-
-
-def require_nothing_left(on, sessions):
+        sessions = [weakref.ref(session) for session in on.sessions.values()]
+        assert len(sessions) == 30
     wait_until(lambda: not on.sessions)
-    wait_until(lambda: not session_threads())
+    wait_until(lambda: not any(t.name.startswith("morphgen-") for t in threading.enumerate()))
     wait_until(lambda: all(session() is None for session in sessions))
-
-
-@pytest.mark.slow
-def test_thirty_clients_see_their_own_pages_and_leave_nothing(see, viewer, capfd):
-    on = viewer()
-    memory = []
-
-    def look():
-        pages = [see(robot_query(i), on=on) for i in range(27, 30)]
-        for i, page in zip(range(27, 30), pages, strict=True):
-            page.get_by_role("heading", level=3, name=robot_name(i)).wait_for()
-            page.get_by_text(re.compile("no self-collision")).wait_for()
-        assert len(on.sessions) == 30
-        assert len({id(session.client) for session in on.sessions.values()}) == 30
-        for page in pages:
-            page.context.close()
-
-    for _ in range(2):
-        sessions = crowd(on, 27, look)
-        assert len(sessions) >= 27
-        require_nothing_left(on, sessions)
-        memory.append(resident())
-    assert memory[1] < GROWTH * memory[0]
     assert "Traceback" not in capfd.readouterr().err
