@@ -65,7 +65,7 @@ from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.configs import ReachConfig
 from morphgen.tasks.scenes.make import make_batch, make_split_batch
-from morphgen.tasks.sim import bullet_scene
+from morphgen.tasks.sim import bullet
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Contacts
 
 Rate = Callable[[float], float]
@@ -240,12 +240,12 @@ def _ours(
 
 def _hasty(rate: Rate, seconds: float) -> float:
     """Use PyBullet's default number of solver iterations, which panda-gym uses too."""
-    iterations = bullet_scene.ITERATIONS
-    bullet_scene.ITERATIONS = 50
+    iterations = bullet.ITERATIONS
+    bullet.ITERATIONS = 50
     try:
         return rate(seconds)
     finally:
-        bullet_scene.ITERATIONS = iterations
+        bullet.ITERATIONS = iterations
 
 
 def _raw(task: str, robot: str, envs: int, seconds: float) -> float:

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
 from importlib import import_module
-from inspect import signature
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from morphgen.errors import MissingDependencyError, TaskError, nearest
@@ -150,7 +149,7 @@ class Registry(Generic[T]):
 
 
 def _require_task(task: Task[Any, Any]) -> None:
-    """Require a task's name, constants and fields, and methods that take their arguments."""
+    """Require a task's name, constants and fields."""
     # They import numpy, which names alone do not need.
     from morphgen.tasks.task import STANDARD_FIELDS, TaskConfig
 
@@ -171,13 +170,6 @@ def _require_task(task: Task[Any, Any]) -> None:
             raise TaskError(
                 f"{where}: observation field {field.name!r}: the name is taken; choose another"
             )
-    keywords = ("obstacles", "ground", "seeds", "identity")
-    for name, count, names in (("sample", 2, keywords), ("certify", 3, ()), ("make_envs", 3, ())):
-        taken = signature(getattr(task, name))
-        try:
-            taken.bind(*range(count), **dict.fromkeys(names))
-        except TypeError as error:
-            raise TaskError(f"{where}: {name}{taken}: {error}") from error
 
 
 TASKS: Registry[Task[Any, Any]] = Registry(

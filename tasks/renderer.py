@@ -27,7 +27,7 @@ from morphgen.formats.files import require_writable_file
 from morphgen.formats.mjcf.write import to_spec
 from morphgen.formats.picture import gl_context
 from morphgen.model.geometry import Box, Pose, Shape
-from morphgen.model.inertia import bounding_box, box_corners
+from morphgen.model.inertia import bounding_box, box_corners, fit_camera
 from morphgen.model.kinematics import forward_kinematics, movable_positions
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
@@ -418,29 +418,17 @@ def write_video(frames: Iterable[Frame], path: Path, fps: float) -> None:
             writer: Any = imageio.get_writer(image or partial, **_writer_options(path.suffix, fps))
             with writer:
                 for frame in frames:
-                    _append(writer, frame, path)
+                    writer.append_data(frame)
                     written += 1
             if image:
                 partial.write_bytes(image.getvalue())
             else:
                 require_complete(partial, written, path)
-    except OSError as error:
-        raise FormatError(f"cannot write {path}: {error.strerror or error}") from error
-
-
-def _append(writer: Any, frame: Frame, path: Path) -> None:  # noqa: ANN401 - imageio has no type
-    """Append a frame to a video."""
-    try:
-        writer.append_data(frame)
-    except OSError as error:
-        if error.errno is not None:  # else it is imageio's, as it finds the pipe to ffmpeg closed
-            raise
-        raise FormatError(
-            f"cannot write {path}: ffmpeg ended early; does it have the codec libx264, and is "
-            "there room on the disk?"
-        ) from error
-    except RuntimeError as error:
-        raise FormatError(f"cannot write {path}: {error}") from error
+    except OSError as error:  # without a text it is imageio's: the pipe to ffmpeg was closed
+        reason = (
+            error.strerror or "ffmpeg ended early; has it libx264, and is there room on the disk?"
+        )
+        raise FormatError(f"cannot write {path}: {reason}") from error
 
 
 def require_complete(video: Path, frames: int, path: Path) -> None:
@@ -474,25 +462,15 @@ def _writer_options(suffix: str, fps: float) -> dict[str, Any]:
 
 
 def _camera(points: NDArray[np.float64], aspect: float) -> mujoco.MjvCamera:
-    """Return the nearest camera in the fixed direction that sees all points, shape (n, 3).
-
-    A camera at coordinate c on an axis v across the view, at distance d before the origin, sees a
-    point if ``|v - c| <= t (a + d)``, with the point's coordinate a along the view and half the
-    view's width t at 1 m. So ``d >= p - c / t`` and ``d >= n + c / t`` for the largest
-    p = v / t - a and n = -v / t - a.
-    """
+    """Return the nearest camera in the fixed direction that sees all points, shape (n, 3)."""
     rotation = Rotation.from_euler("ZX", [_AZIMUTH - 90, _ELEVATION], degrees=True)
-    R_world_camera = rotation.as_matrix()
-    across, ahead, up = (points @ R_world_camera).T
+    axes = rotation.as_matrix()[:, [0, 2, 1]]  # right, up and forward
+    local = points @ axes
     half = _MARGIN * math.tan(math.radians(FRONT_FOV / 2))
-    centres, distances = [], []
-    for v, t in ((across, half * aspect), (up, half)):
-        p, n = (v / t - ahead).max(), (-v / t - ahead).max()
-        centres.append(t * (p - n) / 2)
-        distances.append((p + n) / 2)
-    mid_depth = (ahead.min() + ahead.max()) / 2
+    across, up, ahead = fit_camera(local, np.array([half * aspect, half]))
+    middle = (local[:, 2].min() + local[:, 2].max()) / 2
     camera = mujoco.MjvCamera()
-    camera.lookat[:] = R_world_camera @ (centres[0], mid_depth, centres[1])
-    camera.distance = max(distances) + mid_depth
+    camera.lookat[:] = axes @ (across, up, middle)
+    camera.distance = middle - ahead
     camera.azimuth, camera.elevation = _AZIMUTH, _ELEVATION
     return camera

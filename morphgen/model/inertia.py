@@ -1,4 +1,4 @@
-"""Mass properties, solid meshes and bounding boxes of shapes."""
+"""Mass properties, solid meshes and bounding boxes of shapes, and cameras that see them."""
 
 from __future__ import annotations
 
@@ -181,6 +181,20 @@ def box_corners(low: ArrayLike, high: ArrayLike) -> Array:
     """Return the corners (8, 3) of an axis-aligned box, from the lowest and the highest [m]."""
     sides = np.stack([np.asarray(low), np.asarray(high)], axis=1)
     return np.array(np.meshgrid(*sides)).reshape(3, -1).T
+
+
+def fit_camera(points: Array, tangents: Array) -> Array:
+    """Return the foremost camera, centred on points (n, 3), that has all of them in its picture.
+
+    All are in the camera's axes: right, up, forward [m]. A point is in the picture if its offset
+    from the camera to the right and up is at most its distance times the tangents (2,).
+    """
+    # Each axis has two such bounds, on the farthest points to both sides. The camera's offset is
+    # between them, and the stricter axis decides its distance.
+    after = (points[:, :2] - tangents * points[:, 2:]).max(axis=0)
+    before = (-points[:, :2] - tangents * points[:, 2:]).max(axis=0)
+    forward = float((-(after + before) / (2 * tangents)).min())
+    return np.array([*((after - before) / 2), forward])
 
 
 @lru_cache(maxsize=4096)

@@ -385,11 +385,6 @@ def test_faults_are_named(make, parts, message):
         ({"name": "float"}, "'float': config_type.task is 'hover'; expected 'float'"),
         ({"config_type": None}, "'hover': the class attribute 'config_type' is missing"),
         ({"config_type": int}, "'hover': config_type is .*int.*; expected a TaskConfig"),
-        (
-            {"sample": lambda self, robot, config: None},
-            r"'hover': sample\(robot, config\): got an unexpected keyword argument 'obstacles'",
-        ),
-        ({"make_envs": lambda _: None}, r"'hover': make_envs\(\): too many positional arguments"),
     ],
 )
 def test_an_incomplete_task_is_not_registered(monkeypatch, parts, message):

@@ -29,8 +29,7 @@ pytest.importorskip("pybullet", reason="PyBullet has no wheel for this Python")
 import pybullet
 
 from morphgen.tasks.sim import bullet
-from morphgen.tasks.sim.bullet import BulletSimulation
-from morphgen.tasks.sim.bullet_scene import OVERSPEED
+from morphgen.tasks.sim.bullet import OVERSPEED, BulletSimulation
 
 PUSHING = (0.0, -0.2, 0.62, np.pi / 2, 0.0)
 """The gantry's plate upright behind the block, off the ground."""

@@ -15,6 +15,7 @@ from morphgen.grammar.compose import compose
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
 from morphgen.model.geometry import Capsule, Shape
+from morphgen.model.inertia import fit_camera
 from morphgen.model.kinematics import forward_kinematics, joint_limits
 from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Link, Robot
@@ -42,7 +43,7 @@ from morphgen.viewer.scene.population import (
     shape_poses,
 )
 from morphgen.viewer.scene.robot import robot_bounds
-from morphgen.viewer.scene.stage import fit_camera, project_points
+from morphgen.viewer.scene.stage import project_points
 
 
 def test_cards_of_a_gallery_lead_to_their_robots(shared_viewer):

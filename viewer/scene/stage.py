@@ -13,7 +13,7 @@ import viser
 from numpy.typing import ArrayLike, NDArray
 
 from morphgen.model.geometry import Box, Capsule, Cylinder, Geometry, Mesh, Shape, Sphere
-from morphgen.model.inertia import box_corners, solid_mesh
+from morphgen.model.inertia import box_corners, fit_camera, solid_mesh
 from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Inertial
 from morphgen.model.rotation import to_matrix
@@ -232,20 +232,6 @@ def place_camera(
     camera.fov = _FOV
     camera.position, camera.look_at = position, position + distance * forward
     camera.near = min(0.01, distance / 50)
-
-
-def fit_camera(points: Array, tangents: Array) -> Array:
-    """Return the foremost camera, centred on points (n, 3), that has all of them in its picture.
-
-    All are in the camera's axes: right, up, forward [m]. A point is in the picture if its offset
-    from the camera to the right and up is at most its distance times the tangents (2,).
-    """
-    # Each axis has two such bounds, on the farthest points to both sides. The camera's offset is
-    # between them, and the stricter axis decides its distance.
-    after = (points[:, :2] - tangents * points[:, 2:]).max(axis=0)
-    before = (-points[:, :2] - tangents * points[:, 2:]).max(axis=0)
-    forward = float((-(after + before) / (2 * tangents)).min())
-    return np.array([*((after - before) / 2), forward])
 
 
 _NEAR = 1e-3  # smallest distance from the camera by which points are divided [m]
