@@ -29,11 +29,6 @@ def fitted(width: int | None) -> Iterator[None]:
         _width.reset(token)
 
 
-def is_whole() -> bool:
-    """Return whether tables are whole here, because no terminal or ``--wide`` is there."""
-    return _width.get() is None
-
-
 def fits(text: str) -> bool:
     """Return whether a text is not wider than the terminal for which this block prints, if any."""
     width = _width.get()

@@ -53,7 +53,7 @@ from morphgen.benchmark.survey import audit
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.files import file_sha256, write_atomic
 from morphgen.formats.data_files import read_json
-from morphgen.formats.files import locked_folder, replacing_folder, writing
+from morphgen.formats.files import locked_folder, writing
 from morphgen.formats.records import Record, read_record
 from morphgen.formats.zip_files import ZipLimits, unpack_zip, write_zip
 from morphgen.grammar.library import Library
@@ -285,25 +285,15 @@ def build_with_goals(
 def write_goals(home: Path, results: Sequence[GoalResult], config: GoalConfig) -> Path:
     """Write goal sets into a split's folder in place of earlier ones; return their folder."""
     require_goal_sets(results)
-    folder = home / GOALS
-    files = dict(goal_files(results, config))
+    files = {f"{GOALS}/{name}": content for name, content in goal_files(results, config)}
     read_sums(home / SUMS_FILE)  # refuses a folder that is not built, before anything is locked
     with writing_split(home), locked_folder(home):
         sums = read_sums(home / SUMS_FILE)
         (home / SUMS_FILE).unlink()  # until all is written, the build is not finished
-        for leftover in home.glob(f".{GOALS}.*"):
-            shutil.rmtree(leftover, ignore_errors=True)
-        with replacing_folder(folder) as partial:
-            for name, content in files.items():
-                (partial / name).parent.mkdir(exist_ok=True)
-                (partial / name).write_bytes(content)
-        sums = {k: digest for k, digest in sums.items() if not k.startswith(f"{GOALS}/")}
-        sums |= {
-            f"{GOALS}/{name}": hashlib.sha256(content).hexdigest()
-            for name, content in files.items()
-        }
-        write_atomic(home / SUMS_FILE, sums_text(sums))
-    return folder
+        shutil.rmtree(home / GOALS, ignore_errors=True)
+        others = {k: digest for k, digest in sums.items() if not k.startswith(f"{GOALS}/")}
+        _add_files(home, files, others)
+    return home / GOALS
 
 
 @dataclass(frozen=True)
@@ -385,10 +375,10 @@ def release_split(
         files = {name: text.encode() for name, text in texts.items()} | dict(extra or {})
         known = [*read_sums(report.folder / SUMS_FILE), *files]
         files[README_FILE] = card_text(split, release, parts, known).encode()
-        _add_files(report.folder, files)
+        _add_files(report.folder, files, read_sums(report.folder / SUMS_FILE))
         sums = read_sums(report.folder / SUMS_FILE)
         croissant = croissant_text(split, release, parts, sums)
-        _add_files(report.folder, {licences.CROISSANT_FILE: croissant.encode()})
+        _add_files(report.folder, {licences.CROISSANT_FILE: croissant.encode()}, sums)
         return _write_archive(report.folder, out, release)
 
 
@@ -406,8 +396,9 @@ def _release(split: Split, request: ReleaseRequest) -> Release:
     return read_record(data, Release, "release", BenchmarkError)
 
 
-def _add_files(folder: Path, files: Mapping[str, bytes]) -> None:
-    sums = read_sums(folder / SUMS_FILE)
+def _add_files(folder: Path, files: Mapping[str, bytes], known: Mapping[str, str]) -> None:
+    """Write files, and their hashes with those of the files that are there."""
+    sums = dict(known)
     for name, content in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_atomic(folder / name, content)

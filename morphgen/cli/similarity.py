@@ -28,11 +28,10 @@ from morphgen.encoding.tokens import tokens as encode
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats.files import require_writable_file, write_file
-from morphgen.grammar.library import Library
 from morphgen.grammar.syntax import parse_derivation
 from morphgen.model.robot import Robot
 from morphgen.progress import part_of
-from morphgen.tables import fits, fitted, is_whole, table
+from morphgen.tables import fits, fitted, table
 from morphgen.typing import Array
 
 MEASURES = ("cosine", "tree", "workspace", "all")
@@ -90,20 +89,16 @@ def _features(args: argparse.Namespace) -> tuple[list[Features], list[str], list
     names = [robot.name for _, robot in pairs]
     if len(set(names)) < len(names):
         names = [source.label for source, _ in pairs]
-    groups = [_group(robot, args.colour, library) for _, robot in pairs] if args.map else []
+    groups = [_group(robot) for _, robot in pairs] if args.map else []
     return computed, names, groups
 
 
-def _group(robot: Robot, colour: str, library: Library) -> str:
-    """Return what robots of one colour have in common: parts and DoF, or the parts of a kind."""
+def _group(robot: Robot) -> str:
+    """Return what robots of one colour have in common: parts and DoF."""
     text = robot.provenance.get("derivation")
     parts = [node.part for node in parse_derivation(str(text)).walk()] if text else []
-    if colour != "structure":
-        parts = [part for part in parts if library.manifest(part).kind == colour]
     runs = [(part, len(list(run))) for part, run in groupby(parts) if part not in ("fixed", "none")]
     words = "-".join(f"{part} x{count}" if count > 1 else part for part, count in runs)
-    if colour != "structure":
-        return words or f"no {colour}"
     return f"{words or 'imported'}, {robot.dof} DoF"
 
 
@@ -124,9 +119,7 @@ def _text(names: Sequence[str], measure: str, values: Array) -> str:
     """Return the table of a measure with its title and statistics."""
     better = "larger" if get_measure(measure).larger_is_more_alike else "smaller"
     rows = _matrix_table(names, values) if len(names) <= LARGEST_MATRIX else ""
-    if not rows and not is_whole():
-        rows = f"{len(names)} robots; --wide shows the nearest of each, --json the matrix"
-    elif not rows or not fits(rows):
+    if not rows or not fits(rows):
         rows = _nearest_table(names, measure, values)
     pairs = values[np.triu_indices(len(values), 1)]  # the matrix is symmetric: each pair once
     low, median, high = np.percentile(pairs, (0, 50, 100))

@@ -325,9 +325,6 @@ class _RecordedStates(Simulation):
         self.q, self.qd = columns["observation.state"], columns["observation.velocity"]
         self.object_pose = columns["observation.object_pose"]
 
-    def faults(self) -> dict[int, str]:
-        return {}
-
     def _reset(self, *_: object) -> None:
         pass  # the states are those that were recorded
 

@@ -1,7 +1,6 @@
 """``morphgen similarity``: output, written files and rejected input."""
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -90,30 +89,11 @@ def test_more_than_twenty_robots_list_the_nearest_of_each(run, ok):
     assert statistics.startswith("210 pairs: ")
 
 
-@pytest.mark.parametrize(
-    ("colour", "groups"),
-    [
-        ("structure", ["imported, 4 DoF", "lwr-claw, 11 DoF", "lwr-plane, 7 DoF"]),
-        ("arm", ["no arm", "lwr", "lwr"]),
-        ("ee", ["no ee", "claw", "plane"]),
-    ],
-)
-def test_a_map_is_coloured_by_structure_or_part(colour, groups, ok, bundles, monkeypatch):
+def test_a_map_is_coloured_by_structure(ok, bundles, monkeypatch):
     drawn = []
     monkeypatch.setattr(figures, "map_png", lambda *arguments: drawn.append(arguments) or b"png")
-    ok("similarity", "robots", "--map", "map.png", "--colour", colour)
-    assert drawn[0][2] == groups
-
-
-def test_a_terminal_shows_the_rows_of_many_robots_on_request(run, ok, monkeypatch):
-    run("sample", "stick", "-n", "21", "--light", "--out", "set", "--json")
-    whole = ok("similarity", "set")
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    monkeypatch.setenv("COLUMNS", "80")
-    assert ok("similarity", "set", "--wide") == whole
-    title, line, statistics = ok("similarity", "set").splitlines()
-    assert (title, statistics) == (whole.splitlines()[0], whole.splitlines()[-1])
-    assert line == "21 robots; --wide shows the nearest of each, --json the matrix"
+    ok("similarity", "robots", "--map", "map.png")
+    assert drawn[0][2] == ["imported, 4 DoF", "lwr-claw, 11 DoF", "lwr-plane, 7 DoF"]
 
 
 def test_robot_without_a_tool_is_rejected_with_its_path(refused, robot_urdf, bundles):
