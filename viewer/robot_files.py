@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import base64
 import io
-import json
 import re
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from html import escape
@@ -17,13 +16,12 @@ from pathlib import Path
 import numpy as np
 import viser
 from PIL import Image
-from platformdirs import user_cache_path
 from viser.infra import StateSerializer
 
 from morphgen.benchmark.survey import robot_stats
 from morphgen.checks import check
 from morphgen.errors import MorphgenError
-from morphgen.files import write_cache_file
+from morphgen.files import kept
 from morphgen.formats.bundle import CARD, MJCF, split_colours, write_bundle
 from morphgen.formats.picture import render
 from morphgen.formats.zip_files import write_entries
@@ -55,18 +53,10 @@ class Thumbnail:
 def make_thumbnail(uri: str, files: FileAccess) -> Thumbnail:
     """Return the thumbnail of a robot, from the user's cache or drawn now. Runs in a worker."""
     try:
-        name = f"{content_hash(uri, files)}.json"
-        path = user_cache_path("morphgen") / f"viewer-{_CACHE_FORMAT}" / name
-        if path.is_file():
-            data = json.loads(path.read_text(encoding="utf-8"))
-            facts = {**data["facts"], "findings": tuple(data["facts"]["findings"])}
-            return Thumbnail(data["thumbnail"], facts)
-        thumbnail = _draw_thumbnail(uri, files)
+        key = (_CACHE_FORMAT, content_hash(uri, files))
+        return kept("thumbnail", key, lambda: _draw_thumbnail(uri, files), (Thumbnail,))
     except (MorphgenError, OSError) as error:
         return Thumbnail("", {"findings": ("broken",)}, files.redact(error))
-    with suppress(OSError):  # without a writable cache it is drawn again next time
-        write_cache_file(path, json.dumps({"thumbnail": thumbnail.image, "facts": thumbnail.facts}))
-    return thumbnail
 
 
 def thumbnail_of_picture(path: Path) -> str:

@@ -28,8 +28,6 @@ from morphgen.viewer.robot_uri import (
     uri_name,
 )
 
-REVEAL = "window.morphgen?.reveal();"
-"""JavaScript that removes the cover, after the content before it has been drawn."""
 _BEFORE = b'<div id="root">'
 _SET_PAGES = ("gallery", "population")  # pages whose subject is a set, a folder or a split
 

@@ -23,7 +23,7 @@ from morphgen.viewer.app.address import (
     parse_count,
     require_few_chosen,
 )
-from morphgen.viewer.app.frame import REVEAL, bar_html, call, shown_address, tray_html
+from morphgen.viewer.app.frame import bar_html, call, shown_address, tray_html
 from morphgen.viewer.app.viser_internals import run_javascript
 from morphgen.viewer.app.workers import SharedResults, Workers
 from morphgen.viewer.robot_uri import FileAccess
@@ -197,7 +197,7 @@ class Session:
 
     def reveal(self) -> None:
         """Remove the cover that hides the page until its content is there."""
-        self.run_script(REVEAL)
+        self.run_script(call("reveal"))
 
     def run_script(self, source: str) -> None:
         """Run JavaScript in the browser."""
