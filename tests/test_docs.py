@@ -248,19 +248,3 @@ def test_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_path
     assert all(f'id="{name}"' in pages["cli"] for name in commands)
     assert 'id="morphgen.compose"' in pages["api"]
     assert "In this repository" not in pages["cli"]
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("base=gantry", ["base", "gantry"]),
-        ("robots/arm3/robot.urdf", ["robots", "arm3", "robot", "urdf"]),
-        ("morphgen.compose(max_links=23)", ["morphgen", "compose", "max", "links", "23"]),
-        ("--where arm3.length=0.3", ["where", "arm3", "length", "0.3"]),
-        ("a &lt;b&gt; &amp; c", ["a", "b", "c"]),
-    ],
-)
-def test_the_search_of_the_site_finds_joined_words(text, words):
-    config = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
-    search = next(entry["search"] for entry in config["plugins"] if "search" in entry)
-    assert [word for word in re.split(search["separator"], text) if word] == words

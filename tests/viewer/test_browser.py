@@ -278,17 +278,6 @@ def test_the_bar_leads_everywhere_and_back_returns(same):
     assert page.failures == []
 
 
-def test_leaving_a_page_leaves_nothing_of_it(same, viewer):
-    on = viewer()
-    page = same("?robot=words:arm=ur5 ee=plane&show=visual,frames,workspace", on=on)
-    page.get_by_text("no self-collision").wait_for()
-    bar(page, "Splits").click()
-    page.get_by_text("Open which split?").wait_for()
-    page.wait_for_timeout(3000)
-    assert set(nodes(on)) <= {"/light"}
-    assert page.get_by_role("tab").count() == 0
-
-
 def test_the_theme_changes_without_a_new_page(same):
     page = same("?compare=robots/some-arm&joint1=0.5")
     page.get_by_text("1 robot", exact=True).wait_for()

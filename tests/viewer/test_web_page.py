@@ -22,7 +22,7 @@ import zstandard
 from PIL import Image
 
 import morphgen.viewer
-from helpers.pages import wait_until
+from helpers.pages import nodes, wait_until
 from helpers.robots import arm
 from helpers.viser_client import PlainClient
 from morphgen.cli import build_parser
@@ -204,8 +204,10 @@ def test_a_script_opens_another_page_in_place(viewer):
         (second,) = on.sessions.values()
         assert first.closed.is_set()
         assert second.events is first.events
+        wait_until(lambda: "/robot/1/visual0" in nodes(on))
         assert script.send("open", "?robot=nowhere", visit=2) == 200
         client.shows("no such file or folder")
+        assert set(nodes(on)) <= {"/light"}
 
 
 def test_a_script_chooses_robots(viewer):
