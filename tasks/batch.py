@@ -220,14 +220,7 @@ class TaskBatch:
         return self.finish(before, self.simulation.step(before.targets))
 
     def act(self, actions: torch.Tensor) -> BeforePhysics:
-        """Advance the joint targets by the actions: the part of ``step`` before the physics.
-
-        Args:
-            actions: As of ``step``.
-
-        Raises:
-            TaskError: If the actions are invalid.
-        """
+        """Advance the joint targets by the actions: the part of ``step`` before the physics."""
         mask = self.action_mask
         normalized = self.decode_actions(actions.to(self.device), mask.shape)
         self.motion.act(torch.where(mask, normalized, 0.0))
@@ -235,12 +228,7 @@ class TaskBatch:
         return BeforePhysics(targets, self.q, self.simulation.object_pose.clone())
 
     def finish(self, before: BeforePhysics, diverged: torch.Tensor) -> Step:
-        """Evaluate a step and begin new episodes: the part of ``step`` after the physics.
-
-        Args:
-            before: Result of ``act``.
-            diverged: Where the simulation diverged, shape (n,), bool.
-        """
+        """Evaluate a step and begin new episodes: the part of ``step`` after the physics."""
         state = self._undone(before, diverged)
         self.episode_step += 1
         result, reward = self._evaluate(state, diverged)

@@ -26,7 +26,7 @@ from morphgen.model.kinematics import (
 )
 from morphgen.model.robot import TOOL, Joint, JointKind, Link, Pair, Robot, sorted_pair
 from morphgen.model.rotation import Vec3, normalize, to_rpy
-from morphgen.model.tree import rigid_groups
+from morphgen.model.tree import rigid_groups, take_name
 from morphgen.tasks.sim.articulated import ArticulatedObject
 from morphgen.tasks.sim.base import Scene
 from morphgen.typing import Array
@@ -162,10 +162,12 @@ class FreeSpace:
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         link_names = {link.name for link in scene.robot.links}
-        self._obstacles = [_unused(f"obstacle{k}", link_names) for k in range(len(scene.obstacles))]
-        self._block = _unused("block", link_names)
+        self._obstacles = [
+            take_name(f"obstacle{k}", link_names) for k in range(len(scene.obstacles))
+        ]
+        self._block = take_name("block", link_names)
         is_articulated = isinstance(scene.object, ArticulatedObject)
-        bases = [_unused("base", link_names)] if is_articulated else []
+        bases = [take_name("base", link_names)] if is_articulated else []
         self._num_static = len(self._obstacles) + len(bases)
         self._checker = SelfCollisionChecker(
             _with_surroundings(scene, self._obstacles, bases, self._block)
@@ -359,10 +361,10 @@ def _with_surroundings(
     robot = scene.robot
     link_names = {link.name for link in robot.links}
     joint_names = {joint.name for joint in robot.joints}
-    world = Link(_unused("world", link_names))
+    world = Link(take_name("world", link_names))
 
     def joint_name(child: str) -> str:
-        return _unused(f"to_{child}", joint_names)
+        return take_name(f"to_{child}", joint_names)
 
     root = robot.root.name
     to_root = Joint(joint_name("root"), "fixed", world.name, root, scene.T_world_root)
@@ -370,7 +372,7 @@ def _with_surroundings(
     new_joints: list[Joint] = []
     if scene.ground is not None:
         slab = Shape(Box(_GROUND_SIZE), Pose((0.0, 0.0, scene.ground - _GROUND_SIZE[2] / 2)))
-        ground = Link(_unused("ground", link_names), collisions=(slab,))
+        ground = Link(take_name("ground", link_names), collisions=(slab,))
         static_links.append(ground)
         new_joints.append(Joint(joint_name("ground"), "fixed", world.name, ground.name))
     boxes: list[tuple[tuple[Shape, ...], Pose]]
@@ -390,7 +392,7 @@ def _with_surroundings(
             ignored.append((block, static_links[0].name))
         for kind, axis in _MOTIONS:
             is_last = len(block_links) == len(_MOTIONS) - 1
-            name = block if is_last else _unused(f"carrier{len(block_links)}", link_names)
+            name = block if is_last else take_name(f"carrier{len(block_links)}", link_names)
             shapes = scene.object_shapes if is_last else ()
             parent = block_links[-1].name if block_links else world.name
             block_links.append(Link(name, collisions=shapes))
@@ -399,7 +401,7 @@ def _with_surroundings(
     for frame in robot.frames:
         if frame.name == TOOL and (obstacles or block_links):
             ball = Shape(Sphere(_POINT), frame.T_link_frame)
-            point = Link(_unused("point", link_names), collisions=(ball,))
+            point = Link(take_name("point", link_names), collisions=(ball,))
             tool_links.append(point)
             new_joints.append(Joint(joint_name("point"), "fixed", frame.link, point.name))
             ignored += [
@@ -414,10 +416,3 @@ def _with_surroundings(
         home=(*robot.home, *(0.0 for _ in (*obstacles, *bases)), *(_AWAY if block_links else ())),
         ignore_pairs=tuple(ignored),
     )
-
-
-def _unused(name: str, taken: set[str]) -> str:
-    """Return the name with as many underscores appended as make it differ from the taken ones."""
-    while name in taken:
-        name += "_"
-    return name

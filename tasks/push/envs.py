@@ -115,8 +115,8 @@ class PushEnvs(TaskEnvs):
         return {"line": np.array(pose, dtype=np.float32)}
 
     def advance(self, progress: float) -> None:
-        """Move the line according to the curriculum; see ``curriculum_line``."""
-        self.line.copy_(curriculum_line(self._config, self._final_line, progress))
+        """Move the line according to the curriculum."""
+        self.line.copy_(self._final_line * curriculum_part(self._config, progress))
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return the position of the line."""
@@ -144,11 +144,6 @@ def push_terms(
         "approach": -config.approach_weight * approach,
         "success": choose(success, config.success_weight),
     }
-
-
-def curriculum_line(config: PushConfig, line: torch.Tensor, progress: float) -> torch.Tensor:
-    """Return the position of the line in a curriculum, shape as ``line``."""
-    return line * curriculum_part(config, progress)
 
 
 def curriculum_part(config: ObjectTaskConfig, progress: float) -> float:

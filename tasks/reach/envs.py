@@ -24,17 +24,28 @@ class ReachFormulas(StepFormulas[A]):
         self._goal_rotation: A | None = goal_rotation
 
     def evaluate(self, state: TaskState[A]) -> StepResult[A]:
-        """Compare the tools with their goals."""
-        angle, config = None, self._config
+        """Compare the tools with their goals (paper; ``rotation`` is ours)."""
+        config = self._config
+        distance, angle = row_norms(state.tool - self._goal[..., :3]), None
+        near = distance < config.near
+        terms = {
+            "joint_limits": -config.joint_limit_weight * state.limit_violation,
+            "joint_acceleration": -config.joint_acceleration_weight * state.acceleration,
+            "distance": -config.distance_weight * distance,
+        }
         if state.tool_rotation is not None and self._goal_rotation is not None:
             angle = angles_between(state.tool_rotation, self._goal_rotation)
-        distance = row_norms(state.tool - self._goal[..., :3])
+            near = near & (angle < config.near_angle)
+        terms["near"] = choose(near, config.near_weight)
+        if angle is not None:
+            terms["rotation"] = -config.rotation_weight * config.metres_per_radian * angle
+        far = -config.score_square * (distance * distance)
         return StepResult(
-            success=is_near(config, distance, angle) & ~state.diverged,
+            success=near & ~state.diverged,
             terminated=state.diverged & ~state.diverged,  # never: an episode lasts until its limit
             distance=distance,
-            score=anybody_score(config, distance, angle),
-            terms=reach_terms(config, distance, state.limit_violation, state.acceleration, angle),
+            score=choose(near, config.score_near, far),
+            terms=terms,
             angle=angle,
         )
 
@@ -97,34 +108,3 @@ class ReachEnvs(TaskEnvs):
     def marker_poses(self, row: int) -> dict[str, NDArray[np.float32]]:
         """Return the pose of the goal."""
         return {"goal": np.array(self.goal[row].cpu().numpy())}
-
-
-def is_near(config: ReachConfig, distance: A, angle: A | None = None) -> A:
-    """Return whether tools at distances (k,) [m] and angles (k,) [rad] are at their goals."""
-    near = distance < config.near
-    return near if angle is None else near & (angle < config.near_angle)
-
-
-def reach_terms(
-    config: ReachConfig,
-    distance: A,
-    limit_violation: A,
-    acceleration: A,
-    angle: A | None = None,
-) -> dict[str, A]:
-    """Return the reward terms of reach (paper, tables of reward terms; ``rotation`` is ours)."""
-    terms = {
-        "joint_limits": -config.joint_limit_weight * limit_violation,
-        "joint_acceleration": -config.joint_acceleration_weight * acceleration,
-        "distance": -config.distance_weight * distance,
-        "near": choose(is_near(config, distance, angle), config.near_weight),
-    }
-    if angle is not None:
-        terms["rotation"] = -config.rotation_weight * config.metres_per_radian * angle
-    return terms
-
-
-def anybody_score(config: ReachConfig, distance: A, angle: A | None = None) -> A:
-    """Return the score of a step, shape (k,): a bonus where near, else the squared distance."""
-    far = -config.score_square * (distance * distance)
-    return choose(is_near(config, distance, angle), config.score_near, far)

@@ -36,8 +36,8 @@ from morphgen.tasks.actions import ActionDecoder, JointMotion
 from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.gym.vector import TaskVector
 from morphgen.tasks.observation import LinkTokens
-from morphgen.tasks.push.envs import PushFormulas, curriculum_line, push_terms
-from morphgen.tasks.reach.envs import ReachEnvs, ReachFormulas, anybody_score, is_near, reach_terms
+from morphgen.tasks.push.envs import PushFormulas, curriculum_part, push_terms
+from morphgen.tasks.reach.envs import ReachEnvs, ReachFormulas
 from morphgen.tasks.reach.task import Reach
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.rows import limit_violation, numpy_row, positive_part
@@ -101,18 +101,35 @@ def test_targets_stay_within_limits_and_masked_links_do_not_move(robot_tables):
     assert torch.equal(motion.targets[0], torch.where(moved, upper, home))
 
 
+def reached(config, distance, angle=None, violation=0.0, acceleration=0.0):
+    """Return the results of tools at distances from their goals, and turned by angles about z."""
+    n = len(distance)
+    tool, rotation, numbers = torch.zeros(n, 3), torch.eye(3).repeat(n, 1, 1), torch.zeros(n)
+    tool[:, 0] = distance
+    if angle is not None:
+        rotation[:, 0, 0] = rotation[:, 1, 1] = torch.cos(angle)
+        rotation[:, 0, 1], rotation[:, 1, 0] = -torch.sin(angle), torch.sin(angle)
+    state = TaskState(
+        *(tool, torch.zeros(n, 7), numbers + violation, numbers + acceleration, numbers > 0),
+        tool_rotation=None if angle is None else rotation,
+    )
+    goals = torch.eye(3).repeat(n, 1, 1) if config.goal == "pose" else None
+    return ReachFormulas(config, torch.zeros(n, 7), goals).evaluate(state)
+
+
 def test_reach_reward_terms():
     config = ReachConfig()
     distance = torch.tensor([0.029, 0.031])
     q = torch.tensor([[1.5, 0.0], [0.0, -2.5]])
     violation = limit_violation(q, torch.tensor([-1.0, -2.0]), torch.tensor([1.0, 2]))
     assert violation.tolist() == pytest.approx([0.5, 0.5])
-    terms = reach_terms(config, distance, violation, torch.tensor([10.0, 0.0]))
+    result = reached(config, distance, None, violation, torch.tensor([10.0, 0.0]))
+    terms = result.terms
     assert terms["near"].tolist() == [config.near_weight, 0.0]
     assert terms["distance"].tolist() == pytest.approx([-0.029, -0.031])
     assert terms["joint_limits"].tolist() == pytest.approx([-0.5, -0.5])
     assert terms["joint_acceleration"].tolist() == pytest.approx([-1e-4, 0.0])
-    assert anybody_score(config, distance).tolist() == pytest.approx([200.0, -50 * 0.031**2])
+    assert result.score.tolist() == pytest.approx([200.0, -50 * 0.031**2])
 
 
 def test_push_reward_terms():
@@ -135,12 +152,11 @@ def test_a_diverged_step_is_never_a_success():
     assert pushed.score.tolist() == [1.0, 0.0]
 
 
-def test_curriculum_line_moves_during_the_first_half_of_training():
-    line = torch.tensor([0.2, 0.1])
-    places = [curriculum_line(PushConfig(), line, p / 100)[0].item() for p in range(101)]
-    assert places[0] == pytest.approx(0.02)
-    assert places[:51] == sorted(set(places))
-    assert places[50:] == [pytest.approx(0.2)] * 51
+def test_curriculum_grows_during_the_first_half_of_training():
+    parts = [curriculum_part(PushConfig(), p / 100) for p in range(101)]
+    assert parts[0] == pytest.approx(0.1)
+    assert parts[:51] == sorted(set(parts))
+    assert parts[50:] == [pytest.approx(1.0)] * 51
 
 
 FOLDERS = default_library(()).folders
@@ -223,19 +239,18 @@ def made(tmp_path, opened):
 def test_success_needs_position_and_orientation():
     distance = torch.tensor([0.02, 0.02, 0.04, 0.04])
     angle = torch.tensor([9.0, 11.0, 9.0, 11.0]).deg2rad()
-    assert is_near(POSE, distance, angle).tolist() == [True, False, False, False]
-    assert is_near(POSITION, distance).tolist() == [True, True, False, False]
-    score = anybody_score(POSE, distance, angle)
-    assert score.tolist() == pytest.approx([200, -50 * 0.02**2, -50 * 0.04**2, -50 * 0.04**2])
+    assert reached(POSITION, distance).success.tolist() == [True, True, False, False]
+    result = reached(POSE, distance, angle)
+    assert result.success.tolist() == [True, False, False, False]
+    expected = [200, -50 * 0.02**2, -50 * 0.04**2, -50 * 0.04**2]
+    assert result.score.tolist() == pytest.approx(expected)
 
 
 def test_the_rotation_term_weighs_the_angle_as_the_distance_of_the_same_tolerance():
     config = replace(POSE, near=0.05, near_angle=0.25, rotation_weight=3.0)
-    zeros = torch.zeros(2)
-    terms = reach_terms(config, torch.tensor([0.05, 0.1]), zeros, zeros, torch.tensor([0.25, 0.5]))
+    terms = reached(config, torch.tensor([0.05, 0.1]), torch.tensor([0.25, 0.5])).terms
     assert terms["rotation"].tolist() == pytest.approx([-0.15, -0.3])
     assert torch.allclose(terms["rotation"], 3 * terms["distance"])
-    assert "rotation" not in reach_terms(config, zeros, zeros, zeros)
 
 
 def test_at_its_goals_configuration_a_robot_succeeds_and_elsewhere_the_angle_is_that_of_the_tool(
