@@ -21,7 +21,7 @@ from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Link, Robot
 from morphgen.splits.split import find_split, read_split
 from morphgen.viewer.app.address import AddressError
-from morphgen.viewer.pages.gallery import make_member, parse_range, save_split
+from morphgen.viewer.pages.gallery import parse_range
 from morphgen.viewer.pages.population import (
     compare_robots,
     find_source,
@@ -31,7 +31,7 @@ from morphgen.viewer.pages.population import (
     selection_text,
     similarity_table,
 )
-from morphgen.viewer.pages.split import map_svg
+from morphgen.viewer.pages.split import make_member, map_svg, save_split
 from morphgen.viewer.robot_rows import Row
 from morphgen.viewer.robot_uri import member_uri, read_robot_uri
 from morphgen.viewer.scene import population as populations

@@ -17,7 +17,7 @@ PAGES: Mapping[str, str] = {
     "population": "morphgen.viewer.pages.population:show",
     "robot": "morphgen.viewer.pages.robot:show",
     "compose": "morphgen.viewer.pages.compose:show",
-    "chosen": "morphgen.viewer.pages.gallery:show_chosen",
+    "chosen": "morphgen.viewer.pages.split:show_chosen",
     "compare": "morphgen.viewer.pages.population:show_compared",
     "split": "morphgen.viewer.pages.split:show",
     "play": "morphgen.viewer.pages.play:show",

@@ -1,40 +1,23 @@
-"""The pages that are galleries: all parts (the first page), a folder, chosen robots; indexes."""
+"""The pages that are galleries: all parts (the first page), and a folder; indexes."""
 
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, field
 from html import escape
-from pathlib import Path
 from typing import Any
 
 import viser
 
-from morphgen.encoding.robot_hash import robot_hash
-from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.formats.bundle import PICTURE
-from morphgen.grammar.compose import compose
 from morphgen.grammar.grammar_file import grammar_names
-from morphgen.grammar.syntax import parse_derivation
 from morphgen.rl.demonstrations.lerobot import RECORDING
 from morphgen.splits.split import (
-    COMPOSED,
-    HOLD_OUT,
-    REGIMES,
-    SIDES,
-    Member,
-    Regime,
-    Split,
-    require_split_name,
     split_names,
-    write_split,
 )
-from morphgen.tasks.registry import TASKS
 from morphgen.viewer import markup, robot_rows
 from morphgen.viewer.app.address import Address, AddressError, parse_count
 from morphgen.viewer.app.frame import call
@@ -43,12 +26,7 @@ from morphgen.viewer.app.uploads import store_upload
 from morphgen.viewer.robot_files import Thumbnail, make_thumbnail, thumbnail_of_picture
 from morphgen.viewer.robot_uri import (
     DEFAULT_WORDS,
-    MEMBER,
     FileAccess,
-    read_robot_uri,
-    resolve_derivation,
-    resolve_member,
-    shorten,
 )
 
 
@@ -327,9 +305,6 @@ INTRODUCTION = (
     "Compose a robot</a></p>"
 )
 """Text above the gallery of parts: the purpose of morphgen, and the link to Compose."""
-NONE_CHOSEN = (
-    "No robot is chosen: tick the box of cards in a gallery, or select robots of a population."
-)
 
 
 def show_library(session: Session) -> None:
@@ -370,107 +345,7 @@ def show(session: Session) -> None:
     add_controls(gallery)
 
 
-def show_chosen(session: Session) -> None:
-    """Build the page of the chosen robots, which become the two sides of a new split."""
-    if not session.chosen:
-        raise MorphgenError(NONE_CHOSEN)
-    rows = robot_rows.uri_rows(session.chosen, session.files)
-    gallery = Gallery(session, "Chosen robots", rows, SIDES)
-    header = "The first robots that you chose are to train on, the others to test on."
-    open_panels(gallery, markup.breadcrumbs(("chosen robots", None)), markup.dim(header))
-    num_train = session.client.gui.add_slider("to train on", 0, len(rows), 1, max(len(rows) - 1, 1))
-    bind(session, "train", num_train)
-    session.apply_state()
-    _set_sides(gallery.rows, num_train.value)
-
-    def divide() -> None:
-        _set_sides(gallery.rows, num_train.value)
-        show_page(gallery, 1)
-
-    def sides() -> tuple[list[robot_rows.Row], list[robot_rows.Row]]:
-        return gallery.rows[: num_train.value], gallery.rows[num_train.value :]
-
-    def leave_out() -> None:
-        address = replace(session.address, subjects=session.chosen or ("",))
-        session.open_address(address, instead=True)
-
-    add_controls(gallery)
-    add_split_form(session, sides)
-    session.on_change(num_train, divide, "sides")
-    session.on_choice = leave_out
-
-
-def _set_sides(rows: list[robot_rows.Row], num_train: int) -> None:
-    rows[:] = [replace(row, role=SIDES[int(i >= num_train)]) for i, row in enumerate(rows)]
-
-
-REGIMES_TO_SAVE = tuple(regime for regime in REGIMES if regime != HOLD_OUT)
-"""Regimes of splits that the viewer saves; it has no controls for what a hold-out split says."""
 SPLITS = "splits"  # folder in which new splits are written
-MAX_NAME = 200  # longest name of a split [characters]
-
-
-def make_member(task: str, obstacles: bool, files: FileAccess, row: robot_rows.Row) -> Member:
-    """Return the robot of a row as a member of a split. Runs in a worker."""
-    uri = row.uri
-    if uri.startswith(MEMBER):
-        return replace(resolve_member(uri, files), task=task, obstacles=obstacles)
-    robot = read_robot_uri(uri, files)
-    derivation = str(resolve_derivation(uri, files) or robot.provenance.get("derivation", ""))
-    if not derivation:
-        raise BenchmarkError(f"{uri} was imported: a split names robots by their derivations")
-    composed = compose(parse_derivation(derivation), files.library, robot.name)
-    hash_ = robot_hash(composed)
-    return Member(robot.name, row.category or COMPOSED, derivation, task, obstacles, hash_)
-
-
-def save_split(
-    name: str, regime: Regime, train: Sequence[Member], test: Sequence[Member], files: FileAccess
-) -> Path:
-    """Write a split's file into ``splits/`` of the folder where the viewer was started."""
-    require_split_name(name)
-    if not train or not test:
-        raise BenchmarkError(
-            f"{len(train)} train and {len(test)} test robots: at least one of each is needed"
-        )
-    if len(name) > MAX_NAME:
-        raise BenchmarkError(f"name {shorten(name)!r}: at most {MAX_NAME} characters")
-    path = files.roots[0] / SPLITS / f"{name}.yaml"
-    if path.exists():
-        raise BenchmarkError(f"{path} exists; choose another name")
-    summary = f"{len(train)} robots to train on, {len(test)} to test on, chosen in the viewer"
-    write_split(Split(name, regime, summary, tuple(train), tuple(test)), path)
-    return path
-
-
-def add_split_form(
-    session: Session, choose_sides: Callable[[], tuple[list[robot_rows.Row], list[robot_rows.Row]]]
-) -> None:
-    """Add controls that save a new split for a task, and show the command that audits it.
-
-    The function returns the robots to train on and those to test on.
-    """
-    gui = session.client.gui
-    with gui.add_folder("New split"):
-        name = gui.add_text("split name", "")
-        regime = gui.add_dropdown("regime", REGIMES_TO_SAVE)
-        task = gui.add_dropdown("task", tuple(TASKS))
-        obstacles = gui.add_checkbox("obstacles", False)
-        text = gui.add_html("")
-        button = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
-
-    def save() -> None:
-        make = partial(make_member, task.value, obstacles.value, session.files)
-        with session.activity("composing {} robots"):
-            train, test = (list(session.workers.map(make, rows)) for rows in choose_sides())
-        path = save_split(name.value, regime.value, train, test, session.files)
-        shown = str(path.relative_to(session.files.roots[0]))
-        text.content = markup.framed(markup.code(f"morphgen split audit {shlex.quote(shown)}"))
-        session.notify("Saved", shown)
-
-    session.on_press(button, save)
-
-
 INDEX_WIDTH = 620.0  # width of the panel [pixels]
 _TITLES = {
     "gallery": "Open the gallery of which robots?",

@@ -1,10 +1,11 @@
-"""The page of a split: its robots, a map of their similarity, and the audit."""
+"""The pages of a split, its robots, a map of their similarity and the audit, and of a new one."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
 from pathlib import Path
@@ -24,18 +25,41 @@ from morphgen.benchmark.survey import (
     different_members,
     survey_robot,
 )
+from morphgen.encoding.robot_hash import robot_hash
 from morphgen.encoding.similarity import MEASURES, classical_mds, to_distances
-from morphgen.errors import BenchmarkError
+from morphgen.errors import BenchmarkError, MorphgenError
+from morphgen.grammar.compose import compose
 from morphgen.grammar.library import Library
-from morphgen.splits.split import SIDES, Split, split_id
+from morphgen.grammar.syntax import parse_derivation
+from morphgen.splits.split import (
+    COMPOSED,
+    HOLD_OUT,
+    REGIMES,
+    SIDES,
+    Member,
+    Regime,
+    Split,
+    require_split_name,
+    split_id,
+    write_split,
+)
+from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
 from morphgen.viewer import markup
 from morphgen.viewer.app.address import Address
-from morphgen.viewer.app.session import Session
+from morphgen.viewer.app.session import Session, bind
 from morphgen.viewer.app.workers import Workers
 from morphgen.viewer.pages import gallery as gallery_page
-from morphgen.viewer.robot_rows import Row, split_rows
-from morphgen.viewer.robot_uri import resolve_split
+from morphgen.viewer.robot_rows import Row, split_rows, uri_rows
+from morphgen.viewer.robot_uri import (
+    MEMBER,
+    FileAccess,
+    read_robot_uri,
+    resolve_derivation,
+    resolve_member,
+    resolve_split,
+    shorten,
+)
 
 PANEL_WIDTH = 520.0  # largest width of the controls [pixels]
 PANEL_SHARE = 0.36  # largest share of the window for the controls: names on the map stay readable
@@ -217,3 +241,110 @@ def map_cells(points: Array) -> NDArray[np.intp]:
     cells = np.stack(np.divmod(np.arange(rows * columns), columns)[::-1], axis=1)
     _, chosen = linear_sum_assignment(cdist(wanted, cells, "sqeuclidean"))
     return np.asarray(cells[chosen])
+
+
+NONE_CHOSEN = (
+    "No robot is chosen: tick the box of cards in a gallery, or select robots of a population."
+)
+
+
+def show_chosen(session: Session) -> None:
+    """Build the page of the chosen robots, which become the two sides of a new split."""
+    if not session.chosen:
+        raise MorphgenError(NONE_CHOSEN)
+    rows = uri_rows(session.chosen, session.files)
+    gallery = gallery_page.Gallery(session, "Chosen robots", rows, SIDES)
+    header = "The first robots that you chose are to train on, the others to test on."
+    gallery_page.open_panels(
+        gallery, markup.breadcrumbs(("chosen robots", None)), markup.dim(header)
+    )
+    num_train = session.client.gui.add_slider("to train on", 0, len(rows), 1, max(len(rows) - 1, 1))
+    bind(session, "train", num_train)
+    session.apply_state()
+    _set_sides(gallery.rows, num_train.value)
+
+    def divide() -> None:
+        _set_sides(gallery.rows, num_train.value)
+        gallery_page.show_page(gallery, 1)
+
+    def sides() -> tuple[list[Row], list[Row]]:
+        return gallery.rows[: num_train.value], gallery.rows[num_train.value :]
+
+    def leave_out() -> None:
+        address = replace(session.address, subjects=session.chosen or ("",))
+        session.open_address(address, instead=True)
+
+    gallery_page.add_controls(gallery)
+    add_split_form(session, sides)
+    session.on_change(num_train, divide, "sides")
+    session.on_choice = leave_out
+
+
+def _set_sides(rows: list[Row], num_train: int) -> None:
+    rows[:] = [replace(row, role=SIDES[int(i >= num_train)]) for i, row in enumerate(rows)]
+
+
+REGIMES_TO_SAVE = tuple(regime for regime in REGIMES if regime != HOLD_OUT)
+"""Regimes of splits that the viewer saves; it has no controls for what a hold-out split says."""
+MAX_NAME = 200  # longest name of a split [characters]
+
+
+def make_member(task: str, obstacles: bool, files: FileAccess, row: Row) -> Member:
+    """Return the robot of a row as a member of a split. Runs in a worker."""
+    uri = row.uri
+    if uri.startswith(MEMBER):
+        return replace(resolve_member(uri, files), task=task, obstacles=obstacles)
+    robot = read_robot_uri(uri, files)
+    derivation = str(resolve_derivation(uri, files) or robot.provenance.get("derivation", ""))
+    if not derivation:
+        raise BenchmarkError(f"{uri} was imported: a split names robots by their derivations")
+    composed = compose(parse_derivation(derivation), files.library, robot.name)
+    hash_ = robot_hash(composed)
+    return Member(robot.name, row.category or COMPOSED, derivation, task, obstacles, hash_)
+
+
+def save_split(
+    name: str, regime: Regime, train: Sequence[Member], test: Sequence[Member], files: FileAccess
+) -> Path:
+    """Write a split's file into ``splits/`` of the folder where the viewer was started."""
+    require_split_name(name)
+    if not train or not test:
+        raise BenchmarkError(
+            f"{len(train)} train and {len(test)} test robots: at least one of each is needed"
+        )
+    if len(name) > MAX_NAME:
+        raise BenchmarkError(f"name {shorten(name)!r}: at most {MAX_NAME} characters")
+    path = files.roots[0] / gallery_page.SPLITS / f"{name}.yaml"
+    if path.exists():
+        raise BenchmarkError(f"{path} exists; choose another name")
+    summary = f"{len(train)} robots to train on, {len(test)} to test on, chosen in the viewer"
+    write_split(Split(name, regime, summary, tuple(train), tuple(test)), path)
+    return path
+
+
+def add_split_form(
+    session: Session, choose_sides: Callable[[], tuple[list[Row], list[Row]]]
+) -> None:
+    """Add controls that save a new split for a task, and show the command that audits it.
+
+    The function returns the robots to train on and those to test on.
+    """
+    gui = session.client.gui
+    with gui.add_folder("New split"):
+        name = gui.add_text("split name", "")
+        regime = gui.add_dropdown("regime", REGIMES_TO_SAVE)
+        task = gui.add_dropdown("task", tuple(TASKS))
+        obstacles = gui.add_checkbox("obstacles", False)
+        text = gui.add_html("")
+        button = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY)
+
+    def save() -> None:
+        make = partial(make_member, task.value, obstacles.value, session.files)
+        with session.activity("composing {} robots"):
+            train, test = (list(session.workers.map(make, rows)) for rows in choose_sides())
+        path = save_split(name.value, regime.value, train, test, session.files)
+        shown = str(path.relative_to(session.files.roots[0]))
+        text.content = markup.framed(markup.code(f"morphgen split audit {shlex.quote(shown)}"))
+        session.notify("Saved", shown)
+
+    session.on_press(button, save)
