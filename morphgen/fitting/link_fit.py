@@ -115,6 +115,8 @@ def _measure(primitives: tuple[Shape, ...], single: Shape | None, solid: Solid) 
 SolidPrimitive = Box | Cylinder | Capsule  # a primitive; a sphere is a capsule of length 0
 _ON_SURFACE = 1e-6
 """Distance up to which a point counts as on the surface of the solid, not outside [m]."""
+_SEED = 1  # not that of a search, whose sample points a fit may suit too well
+_VOLUME_POINTS, _SURFACE_POINTS = 32768, 8192  # numbers of sample points
 _SECTIONS = 128  # number of sides of a tessellated circle, within 0.03% of its radius
 _SUBDIVISIONS = 4
 """Number of subdivisions of the icosahedron of a tessellated sphere, within 0.1% of its radius; one
@@ -137,14 +139,7 @@ class Quality:
     hausdorff: float  # largest distance of a point of either surface to the other surface [m]
 
 
-def quality(
-    solid: Solid,
-    primitives: Sequence[Shape],
-    *,
-    seed: int = 1,
-    volume_points: int = 32768,
-    surface_points: int = 8192,
-) -> Quality:
+def quality(solid: Solid, primitives: Sequence[Shape]) -> Quality:
     """Measure how well primitives, at least one, approximate a solid in the link frame.
 
     The surface of a solid with holes consists of the triangles that exist. Triangles inside of the
@@ -152,21 +147,21 @@ def quality(
     """
     vertices = np.asarray(solid.mesh.vertices)[solid.mesh.referenced_vertices]
     at_vertices = signed_distance(primitives, vertices)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(_SEED)
     R, low, high = _bounding_box(primitives, vertices)
     # In the smallest box, most points are near a surface and tell the volumes apart.
-    points = (low + (high - low) * _sobol(volume_points, rng)) @ R.T
+    points = (low + (high - low) * _sobol(_VOLUME_POINTS, rng)) @ R.T
     in_primitives, in_solid = signed_distance(primitives, points) <= 0, solid.contains(points)
     if not in_solid.any():
         raise FitError(f"none of {len(points)} sample points lies in the solid")
     intersection = np.count_nonzero(in_primitives & in_solid)
 
     union = _union(primitives)
-    outer = _surface_points(union, surface_points, rng)
+    outer = _surface_points(union, _SURFACE_POINTS, rng)
     to_solid = solid.distance(outer)
     protrusion = np.where(solid.contains(outer), 0.0, to_solid)
 
-    surface = solid.surface(surface_points, rng)
+    surface = solid.surface(_SURFACE_POINTS, rng)
     signed = signed_distance(primitives, surface)
     gap = np.maximum(signed, 0.0)
     # Distances of triangles to convex primitives are largest at vertices. Vertices inside of the
@@ -253,9 +248,9 @@ def _half_extents(shape: Shape, R: Array) -> Array:
 
 
 def _sobol(n: int, rng: np.random.Generator) -> Array:
-    """Return at least ``n`` scrambled Sobol points in the unit cube, a power of two."""
+    """Return ``n`` scrambled Sobol points in the unit cube, a power of two."""
     sampler = qmc.Sobol(3, scramble=True, seed=rng)  # errors of two volumes cancel on one sample
-    return np.asarray(sampler.random_base2(max(n - 1, 1).bit_length()))
+    return np.asarray(sampler.random(n))
 
 
 def _union(primitives: Sequence[Shape]) -> trimesh.Trimesh:

@@ -29,7 +29,7 @@ from morphgen.checks import check, fix, rules
 from morphgen.checks.rules import DEFAULT_DENSITY, MAX_GAP, check_links_apart
 from morphgen.grammar.library import default_library
 from morphgen.grammar.part import load_part
-from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
+from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape, Sphere
 from morphgen.model.inertia import inertial_from_density
 from morphgen.model.robot import (
     DEFAULT_EFFORT,
@@ -306,32 +306,6 @@ def test_a_rod_in_the_opening_of_a_ring_is_apart_from_it(tmp_path):
     assert gap_findings(pair(ring, Cylinder(0.01, 0.5))) == [
         ("links parent, child", f"at home their visual shapes are {within:.3g} mm apart")
     ]
-
-
-@pytest.mark.slow
-def test_distances_of_dense_meshes_do_not_depend_on_the_coarse_test(tmp_path, monkeypatch):
-    ball = mesh(tmp_path, "ball.stl", trimesh.creation.icosphere(5, radius=0.1))
-    turned = Pose.from_xyz_rpy((0.0, 0.12, 0.16), (0.3, 0.2, 0.1))
-    for few in (5, 500, 10**6):
-        monkeypatch.setattr(rules, "_COARSE_TRIANGLES", few)
-        assert gap_findings(pair(ball, ball, Pose((0.0, 0.12, 0.16)))) == []
-        assert gap_findings(pair(ball, Sphere(0.1), turned)) == []
-        (where_why,) = gap_findings(pair(ball, ball, replace(turned, position=(0.0, 0.138, 0.184))))
-        assert "30.1 mm" in where_why[1] or "30 mm" in where_why[1]
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_distances_of_primitives_agree_with_their_triangles(seed):
-    rng = np.random.default_rng(seed)
-    kinds = (Box((0.1, 0.2, 0.05)), Sphere(0.05), Cylinder(0.03, 0.2), Capsule(0.03, 0.1))
-    for a in kinds:
-        for b in kinds:
-            rpy = tuple(rng.choice([0.0, np.pi / 2, 0.7], 3))
-            direction = rng.choice([-1.0, 0.0, 1.0], 3)
-            direction[rng.integers(3)] = 1.0
-            way = direction / np.linalg.norm(direction)
-            poses = (Pose.from_xyz_rpy(tuple(far * way), rpy) for far in (0.0, 0.02, 0.35))
-            assert [not gap_findings(pair(a, b, T)) for T in poses] == [True, True, False]
 
 
 def test_unreadable_shapes_and_invalid_joints_are_left_to_other_checks(tmp_path):

@@ -13,7 +13,6 @@ from helpers.commands import run_python
 from helpers.robots import arm
 from morphgen.errors import FitError
 from morphgen.fitting import search
-from morphgen.fitting.canonical import KINDS
 from morphgen.fitting.link_fit import FitOptions, fit_shapes, quality, signed_distance
 from morphgen.fitting.replace_collision import as_spheres, has_only_spheres, link_spheres
 from morphgen.fitting.solid import solid_of, solid_of_mesh
@@ -29,7 +28,6 @@ from morphgen.model.geometry import (
     Sphere,
     dimensions,
 )
-from morphgen.model.inertia import solid_mesh
 
 TILTED = Pose.from_xyz_rpy((0.1, -0.2, 0.3), (0.4, 0.7, -1.1))
 PRIMITIVES = (Box((0.1, 0.2, 0.4)), Cylinder(0.06, 0.3), Sphere(0.1))
@@ -147,27 +145,6 @@ def test_a_solid_that_fills_almost_none_of_its_bounds_is_an_error():
         target_of(Shape(Box((0.4, 0.4, 0.00002)), TILTED))
 
 
-def test_too_few_points_give_no_further_guess():
-    target = target_of(Shape(Box((0.1, 0.2, 0.3))))
-    few = replace(target, inside=target.inside & (np.cumsum(target.inside) < search.MIN_POINTS))
-    assert search.by_pieces(few, 4, [0, 1, 2]) is None
-    one = search.best_single(target)
-    assert search.best_several(few, one, 0) is None
-    some = target.take(target.inside & search.covered(one.candidate, target.points)[0])
-    assert search.by_growth(one.candidate, some, 0) is None
-
-
-@pytest.mark.parametrize("kind", range(len(KINDS)))
-def test_a_point_at_the_centre_has_finite_gradients(kind):
-    points = np.vstack([np.zeros((1, 3)), np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3))])
-    cloud = search.Cloud(points, (np.abs(points) < 0.2).all(axis=1), np.ones(len(points)))
-    arrays = (np.array(each)[None, None] for each in ((0.0,) * 3, (1.0, 0, 0, 0), (0.3, 0.2, 0.1)))
-    start = search.Candidates(np.array([[kind]]), *arrays)
-    moved = search.ascend(start, cloud, search.Round(None, 501, 5, (0.03, 0.002), (0.01, 0.0005)))
-    assert np.isfinite([*moved.centres[0, 0], *moved.quaternions[0, 0]]).all()
-    assert (moved.halves > 0).all()
-
-
 BALLS = ((0.1, 0.0, 0.0, 0.05), (-0.02, 0.03, 0.0, 0.07), (0.0, -0.04, 0.1, 0.04))
 BOX = (0.3, 0.1, 0.08)
 BEST_GRID = 2.01  # volume ratio of eight equal balls on the best grid that cover the box
@@ -210,13 +187,6 @@ def test_spheres_cover_the_share_of_a_box_that_they_must(share):
     assert volume_ratio < 0.9 * BEST_GRID
     assert volume_ratio == pytest.approx(fit.quality.volume_ratio, rel=0.01)
     assert inside == pytest.approx(fit.quality.coverage, abs=1e-3)
-
-
-def test_protruding_share_of_a_ball_around_a_cube():
-    """A sphere of radius r around a cube of edge 2a has six caps of height r - a outside of it."""
-    a, r = 0.05, 0.06
-    measured = quality(solid_of([Shape(Box((2 * a,) * 3))]), [Shape(Sphere(r))])
-    assert measured.protrusion_share == pytest.approx(6 * (r - a) / (2 * r), rel=0.01)
 
 
 @pytest.mark.parametrize(
@@ -422,32 +392,11 @@ def test_the_hausdorff_distance_of_a_filled_slot_is_its_depth(primitives):
     assert measures.hausdorff == pytest.approx(0.096, abs=2e-4)
 
 
-@pytest.mark.parametrize(
-    "geometry", [Box((0.3, 0.2, 0.4)), Cylinder(0.15, 0.3), Sphere(0.2), Capsule(0.1, 0.25)]
-)
-def test_surfaces_are_sampled_uniformly(geometry):
-    small = solid_of([box((0.02, 0.05, 0.01), TILTED_POSE @ at(0.05, 0.02, 0.03))])
-    measures = quality(small, [Shape(geometry, TILTED_POSE)])
-    mesh = solid_mesh(geometry).copy()
-    for _ in range(2 if isinstance(geometry, Sphere) else 0):
-        mesh = mesh.subdivide()
-    mesh.apply_transform(TILTED_POSE.matrix)
-    points, _ = trimesh.sample.sample_surface(mesh, 40_000, seed=3)
-    distance = small.distance(np.asarray(points))
-    assert measures.protrusion_mean == pytest.approx(distance.mean(), rel=0.01)
-    assert measures.protrusion_p95 == pytest.approx(np.percentile(distance, 95), rel=0.01)
-    assert measures.coverage == 1
-
-
 def test_measures_are_reproducible_and_sampling_errors_are_small():
     ball = [Shape(Sphere(0.1))]
     cube = solid_of([UNIT_CUBE])
-    measures = [quality(cube, ball, seed=seed) for seed in range(8)]
-    assert quality(cube, ball, seed=3) == measures[3]
-    assert len({each.gap_mean for each in measures}) == len(measures)
-    error = np.array([each.iou for each in measures]) - math.pi / 6
-    assert np.abs(error).max() < 2e-3
-    assert quality(cube, ball, volume_points=1000) == quality(cube, ball, volume_points=1024)
+    assert quality(cube, ball) == quality(cube, ball)
+    assert quality(cube, ball).iou == pytest.approx(math.pi / 6, abs=2e-3)
 
 
 def test_meshes_empty_lists_and_flat_boxes_are_errors(tmp_path):
@@ -458,5 +407,5 @@ def test_meshes_empty_lists_and_flat_boxes_are_errors(tmp_path):
         with pytest.raises(ValueError, match="primitive"):
             signed_distance(wrong, np.zeros((1, 3)))
     speck = solid_of([box((1e-3, 1e-3, 1e-3))])
-    with pytest.raises(FitError, match="none of 64 sample points"):
-        quality(speck, [Shape(Sphere(1.0), at(5))], volume_points=64)
+    with pytest.raises(FitError, match="none of 32768 sample points"):
+        quality(speck, [Shape(Sphere(10.0), at(5))])

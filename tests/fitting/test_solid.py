@@ -61,15 +61,6 @@ def angle():
     return trimesh.Trimesh(vertices, [*cap[:, ::-1], *(cap + 6), *walls])
 
 
-def half_tube(n=24):
-    """A strip bent around z by half a turn, with a radius of 0.2 and a width of 0.4."""
-    turns = np.linspace(0, math.pi, n)
-    vertices = [(0.2 * math.cos(a), 0.2 * math.sin(a), z) for a in turns for z in (-0.2, 0.2)]
-    firsts = [2 * i for i in range(n - 1)]
-    faces = [three for i in firsts for three in ((i, i + 2, i + 1), (i + 1, i + 2, i + 3))]
-    return trimesh.Trimesh(vertices, faces)
-
-
 def test_a_closed_box_is_its_own_solid():
     solid = solid_of_mesh(box())
     assert (solid.method, solid.decimated_from) == ("watertight", None)
@@ -77,13 +68,6 @@ def test_a_closed_box_is_its_own_solid():
     assert solid.size == pytest.approx(math.hypot(*SIZE))
     assert solid.hull.volume == pytest.approx(BOX_VOLUME)
     assert not solid.contains(np.array([(0.1001, 0, 0), (5, 5, 5)])).any()
-
-
-def test_the_solid_of_an_l_is_not_its_convex_hull():
-    solid = solid_of_mesh(angle())
-    assert solid.method == "watertight"
-    assert counted(solid) == pytest.approx(0.014, rel=1e-9)
-    assert solid.contains(np.array([(-0.15, 0.1, 0), (0, 0, 0)])).tolist() == [True, False]
 
 
 def test_crossings_of_closed_triangles_give_their_winding_numbers():
@@ -185,19 +169,6 @@ def test_a_sphere_with_many_holes_is_solid_by_winding_number(inverted):
     assert counted(solid) == pytest.approx(volume(Sphere(0.2)), rel=0.05)
 
 
-@pytest.mark.parametrize("turned", [False, True])
-def test_half_a_tube_is_solid_by_winding_number(turned):
-    mesh = half_tube()
-    if turned:
-        mesh.invert()
-    solid = solid_of_mesh(mesh)
-    assert solid.method == "winding"
-    inside = GRID[solid.contains(GRID)]
-    assert inside[:, 1].min() > 0
-    assert np.linalg.norm(inside[:, :2], axis=1).max() < 0.2
-    assert 0.3 < counted(solid) / (math.pi * 0.2**2 / 2 * 0.4) < 1
-
-
 def test_a_sheet_that_encloses_almost_nothing_becomes_its_convex_hull():
     axis = np.linspace(-0.2, 0.2, 20)
     x, y = (each.ravel() for each in np.meshgrid(axis, axis, indexing="ij"))
@@ -285,19 +256,6 @@ def test_a_very_large_mesh_is_decimated_and_records_its_face_count(tmp_path, mon
     assert counted(solid) == pytest.approx(volume(Sphere(0.2)), rel=0.01)
     several = solid_of([write(ball, tmp_path / "ball.stl"), Shape(Box(SIZE))])
     assert several.decimated_from == len(ball.faces) + 12
-
-
-def test_the_surface_of_a_box_is_sampled_uniformly():
-    points = solid_of_mesh(box()).surface(6000, np.random.default_rng(0))
-    assert len(points) == pytest.approx(6000, rel=0.02)
-    again = solid_of_mesh(box()).surface(6000, np.random.default_rng(0))
-    np.testing.assert_array_equal(again, points)
-    beyond = np.abs(points) - np.array(SIZE) / 2
-    np.testing.assert_allclose(beyond.max(axis=1), 0, atol=1e-9)
-    x, y, z = SIZE
-    share = np.isclose(beyond, 0, atol=1e-9).mean(axis=0)
-    area = np.array([y * z, x * z, x * y])
-    np.testing.assert_allclose(share, area / area.sum(), atol=0.03)
 
 
 @pytest.mark.parametrize("inverted", [False, True])

@@ -122,7 +122,7 @@ def fitted(seed):
 
 
 def overlap(shapes, *found):
-    return quality(solid_of(shapes), found, volume_points=2**15).iou
+    return quality(solid_of(shapes), found).iou
 
 
 @pytest.mark.slow

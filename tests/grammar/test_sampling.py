@@ -352,7 +352,8 @@ def test_a_folder_interrupted_before_the_first_robot_can_be_continued(tmp_path, 
     assert tree(config.folder) == tree(whole)
 
 
-@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("jobs", [1, 2])
 def test_a_killed_run_resumes_to_the_same_bytes(tmp_path, jobs):
     words = ("sample", "chain", "-n", 8, "--seed", 3, "--light", "--jobs", jobs)
     process = start(*words, "--out", tmp_path / "killed")
