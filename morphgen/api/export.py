@@ -15,8 +15,6 @@ from types import SimpleNamespace
 
 from morphgen.api.checks import bundle_of
 from morphgen.checks.srdf import (
-    MATRIX_SAMPLES,
-    require_tool,
     robot_srdf_text,
 )
 from morphgen.errors import (
@@ -24,11 +22,9 @@ from morphgen.errors import (
     explain_missing_extras,
     nearest,
     path_argument,
-    require_types,
     text_argument,
 )
 from morphgen.files import write_atomic
-from morphgen.fitting.replace_collision import as_spheres, link_spheres
 from morphgen.formats.bundle import (
     MESHES,
     MJCF,
@@ -63,10 +59,6 @@ def export(
     out: str | PathLike[str] | None = None,
     *,
     dark: bool = False,
-    samples: int | None = None,
-    seed: int | None = None,
-    spheres: int | None = None,
-    cover: float | None = None,
     library: LibraryFolders = (),
 ) -> Path:
     """Write a robot for other tools, as a web page, or as a video in which it turns.
@@ -82,10 +74,6 @@ def export(
         out: Output folder; by default the robot's bundle for a file, its parent for a folder, and
             the current folder for other robots.
         dark: Whether an ``html`` page is dark.
-        samples: Number of configurations in which pairs of links are tested, by default 10,000.
-        seed: Seed of these configurations, by default 0.
-        spheres: Replace the collision shapes of each link by so many spheres; in an SRDF, add them.
-        cover: Share of each link's volume that the spheres must cover, such as 0.995.
         library: Folders of your own parts.
 
     Returns:
@@ -98,17 +86,10 @@ def export(
     """
     given = SimpleNamespace(**locals())
     given.out = None if out is None else path_argument("out", out, FormatError)
-    require_types(given, FormatError, samples=1, seed=0, spheres=1)
     if text_argument("format", format, FormatError) not in (valid := (*FILES, *FOLDERS)):
         raise FormatError(f"unknown format {format!r}{nearest(format, valid)}")
-    pairs = ("srdf", "ros2")
-    only = {"dark": ("html",), "samples": pairs, "seed": pairs, "spheres": ("srdf", *FOLDERS)}
-    for name, formats in only.items():
-        is_given = getattr(given, name) is not None and getattr(given, name) is not False
-        if is_given and format not in formats:
-            raise FormatError(f"{name}: only with format {' or '.join(formats)}")
-    if cover is not None and spheres is None:
-        raise FormatError("cover: only with spheres")
+    if dark and format != "html":
+        raise FormatError("dark: only with format html")
     parts, source = default_library(library), None
     if not isinstance(robot, Robot):
         source = find_robot(robot)
@@ -173,24 +154,7 @@ def _glb(robot: Robot, given: SimpleNamespace) -> bytes:
 
 
 def _srdf(robot: Robot, given: SimpleNamespace) -> bytes:
-    require_tool(robot)  # before spheres are fitted
-    # The pairs are those of the robot's own shapes, which planners may test, too.
-    return _srdf_text(robot, _with_spheres(robot, given), given).encode()
-
-
-def _srdf_text(robot: Robot, sphered: Robot, given: SimpleNamespace) -> str:
-    spheres = link_spheres(sphered)
-    return robot_srdf_text(
-        robot, samples=given.samples or MATRIX_SAMPLES, seed=given.seed or 0, spheres=spheres
-    )
-
-
-def _with_spheres(robot: Robot, given: SimpleNamespace) -> Robot:
-    """Return the robot with the spheres that are asked for as its collision shapes, if any."""
-    if given.spheres is None:
-        return robot
-    folders = default_library(given.library).folders  # with the parts' stored fits
-    return as_spheres(robot, folders, spheres=given.spheres, cover=given.cover)
+    return robot_srdf_text(robot).encode()
 
 
 def _with_meshes(robot: Robot, folder: Path, texts: str) -> None:
@@ -204,19 +168,17 @@ def _with_meshes(robot: Robot, folder: Path, texts: str) -> None:
 
 
 def _meshed(robot: Robot, folder: Path, given: SimpleNamespace) -> None:
-    _with_meshes(_with_spheres(robot, given), folder, given.format)
+    _with_meshes(robot, folder, given.format)
 
 
 def _usd(robot: Robot, folder: Path, given: SimpleNamespace) -> None:
     with TemporaryDirectory() as scratch:
-        _with_meshes(_with_spheres(robot, given), Path(scratch), "urdf")
+        _with_meshes(robot, Path(scratch), "urdf")
         convert_urdf(Path(scratch) / URDF, folder)
 
 
 def _ros2(robot: Robot, folder: Path, given: SimpleNamespace) -> None:
-    require_tool(robot)
-    robot = _with_spheres(robot, given)
-    write_ros_package(robot, folder, _srdf_text(robot, robot, given))
+    write_ros_package(robot, folder, robot_srdf_text(robot))
 
 
 TEXTS: Mapping[str, Callable[[Robot, MeshUri], Mapping[str, str]]] = {

@@ -17,10 +17,9 @@ from morphgen.checks.self_collision import ALWAYS_SHARE, SelfCollisionChecker, a
 from morphgen.errors import FormatError, nearest, shortened
 from morphgen.formats.data_files import read_bytes
 from morphgen.formats.xml import parse_xml, read_schema
-from morphgen.model.geometry import Mesh
+from morphgen.model.geometry import Mesh, Sphere
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import TOOL, Frame, Pair, Robot, sorted_pair
-from morphgen.model.rotation import Vec3
 from morphgen.model.tree import below
 
 Reason = Literal["Adjacent", "Default", "Always", "Never", "User"]
@@ -75,28 +74,29 @@ def _with_loose_joints(robot: Robot) -> tuple[Robot, list[int]]:
     return loose, [independent.index(k) for k in robot.independent_joints]
 
 
-def robot_srdf_text(
-    robot: Robot,
-    *,
-    samples: int = MATRIX_SAMPLES,
-    seed: int = 0,
-    spheres: tuple[LinkSpheres, ...] = (),
-) -> str:
+def robot_srdf_text(robot: Robot, *, samples: int = MATRIX_SAMPLES, seed: int = 0) -> str:
     """Return the SRDF of a robot as text, with the evidence of its disabled pairs as a comment.
 
     Every tool has a group ``arm``, the chain from the root, and ``ee`` if it has an end-effector:
     the links of its part, or those around the joints that do not move the tool. The groups of a
-    robot with several limbs are named after them, such as ``left_arm``.
+    robot with several limbs are named after them, such as ``left_arm``. Links that collide as
+    spheres alone have them as a ``link_sphere_approximation``.
     """
     require_tool(robot)
     reasons = collision_matrix(robot, samples=samples, seed=seed)
     root = etree.Element("robot", name=robot.name)
     _write_limbs(root, robot, [*_limbs(robot)])
-    for link, balls in spheres:
-        element = etree.SubElement(root, "link_sphere_approximation", link=link)
-        for center, radius in balls:
-            values = {"center": _numbers(*center), "radius": _numbers(radius)}
-            etree.SubElement(element, "sphere", values)
+    for link in robot.links:
+        balls = [
+            (shape.T_link_shape.position, shape.geometry.radius)
+            for shape in link.collisions
+            if isinstance(shape.geometry, Sphere)
+        ]
+        if balls and len(balls) == len(link.collisions):
+            element = etree.SubElement(root, "link_sphere_approximation", link=link.name)
+            for center, radius in balls:
+                values = {"center": _numbers(*center), "radius": _numbers(radius)}
+                etree.SubElement(element, "sphere", values)
     evidence = _evidence(robot, reasons, f"{samples} configurations sampled with seed {seed}")
     root.append(etree.Comment(f" {evidence} "))
     for (a, b), reason in reasons.items():
@@ -199,15 +199,6 @@ def _gripper_links(robot: Robot, tool: Frame) -> list[str]:
     if links[0] == moving[-1] + 1:
         links = links[1:]
     return [robot.links[i].name for i in links]
-
-
-class LinkSpheres(NamedTuple):
-    """Spheres that approximate a link."""
-
-    link: str
-    spheres: tuple[tuple[Vec3, float], ...]
-    """Centre in the link's frame and radius of each [m]; MoveIt gives a link no collision shape if
-    its only sphere has radius zero."""
 
 
 def require_tool(robot: Robot) -> None:

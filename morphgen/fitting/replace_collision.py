@@ -25,7 +25,6 @@ import numpy as np
 from platformdirs import user_cache_path
 
 from morphgen.checks.self_collision import survey_collisions
-from morphgen.checks.srdf import LinkSpheres
 from morphgen.errors import FitError, FormatError, nearest, one_line
 from morphgen.files import keep_file
 from morphgen.formats.files import replacing_folder
@@ -54,10 +53,9 @@ if TYPE_CHECKING:
     from morphgen.fitting.robot_fit import FitReport
 
 _LOGGER = logging.getLogger(__name__)
-SPHERES = 8  # default number of spheres per link
-_CACHE, _SPHERE_CACHE = "fits-3", "spheres-2"
-"""Folders in the user's cache, or their beginnings; the numbers rise when the same shapes get other
-primitives."""
+SPHERES = 8  # number of spheres per link
+_CACHE, _SPHERE_CACHE = "fits-3", f"spheres-2-{SPHERES}"
+"""Folders in the user's cache; the numbers rise when the same shapes get other primitives."""
 Geometry = Literal["mesh", "primitive", "convex", "sphere"]
 """Collision shapes of a robot. ``mesh``: those of its parts, with meshes whose hulls simulators
 collide. In place of meshes, ``primitive``: fitted boxes, cylinders and spheres; ``convex``: convex
@@ -89,31 +87,23 @@ def as_primitives(robot: Robot, folders: Sequence[Path]) -> Robot:
     return _with_provenance(robot, fits, {"fitter": FITTER_VERSION})
 
 
-def as_spheres(
-    robot: Robot,
-    folders: Sequence[Path] = (),
-    *,
-    spheres: int = SPHERES,
-    cover: float | None = None,
-) -> Robot:
+def as_spheres(robot: Robot, folders: Sequence[Path]) -> Robot:
     """Return the robot with spheres as its collision shapes, from the user's cache or a new fit.
 
     A link of spheres keeps them. The pairs whose contacts are ignored are determined again.
     """
     from morphgen.fitting.link_fit import FitOptions  # needs the extra fit
 
-    options = FitOptions(spheres=spheres, cover=cover)
     stored = read_stored_fits(folders)
     links = [link for link in robot.links if link.collisions]
     others = [link for link in links if not has_only_spheres(link.collisions)]
-    kind = f"{_SPHERE_CACHE}-{spheres}" + (f"-{cover!r}" if cover is not None else "")
-    fits = _cached_fits(others, kind)
+    fits = _cached_fits(others, _SPHERE_CACHE)
     if missing := [link for link in others if link.name not in fits]:
-        fits |= _fit_and_keep(robot, missing, options, kind, stored)
+        fits |= _fit_and_keep(robot, missing, FitOptions(spheres=SPHERES), _SPHERE_CACHE, stored)
     for link in links:
         if has_only_spheres(link.collisions) and (fit := find_fit(link.collisions, robot, stored)):
             fits[link.name] = fit
-    settings = {"fitter": FITTER_VERSION, "spheres": spheres, "cover": cover}
+    settings = {"fitter": FITTER_VERSION, "spheres": SPHERES, "cover": None}
     return _with_provenance(robot, fits, settings)
 
 
@@ -129,22 +119,6 @@ def _with_provenance(
 def has_only_spheres(shapes: Sequence[Shape]) -> bool:
     """Return whether there are shapes, and all are spheres."""
     return bool(shapes) and all(isinstance(shape.geometry, Sphere) for shape in shapes)
-
-
-def link_spheres(robot: Robot) -> tuple[LinkSpheres, ...]:
-    """Return the spheres of the links whose collision shapes are all spheres."""
-    return tuple(
-        LinkSpheres(
-            link.name,
-            tuple(
-                (shape.T_link_shape.position, shape.geometry.radius)
-                for shape in link.collisions
-                if isinstance(shape.geometry, Sphere)
-            ),
-        )
-        for link in robot.links
-        if has_only_spheres(link.collisions)
-    )
 
 
 def _cached_fits(links: Iterable[Link], kind: str) -> dict[str, StoredFit]:

@@ -21,7 +21,6 @@ from morphgen.checks.self_collision import (
     survey_collisions,
 )
 from morphgen.checks.srdf import (
-    LinkSpheres,
     collision_matrix,
     parse_srdf,
     read_srdf,
@@ -317,9 +316,10 @@ TEXT = """\
 
 
 def test_gripper_of_an_imported_arm_is_an_end_effector(tmp_path):
-    robot = replace(arm(), name='arm & "hand"', home=(0.1 + 0.2, -1e-17, 0.01, 0.02))
-    spheres = (LinkSpheres("upper", (((0.1, -0.2, 1 / 7), 0.05),)),)
-    text = robot_srdf_text(robot, samples=10, spheres=spheres)
+    sphere = Shape(Sphere(0.05), Pose((0.1, -0.2, 1 / 7)))
+    robot = arm().with_links([replace(arm().link("upper"), collisions=(sphere,))])
+    robot = replace(robot, name='arm & "hand"', home=(0.1 + 0.2, -1e-17, 0.01, 0.02))
+    text = robot_srdf_text(robot, samples=10)
     assert text.startswith(TEXT)
     (tmp_path / "arm.srdf").write_text(text)
     assert read_srdf(tmp_path / "arm.srdf").get("name") == robot.name

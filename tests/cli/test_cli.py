@@ -20,7 +20,7 @@ from helpers.parts import PINCER
 from helpers.robots import arm
 from morphgen.api import export
 from morphgen.checks.readers import LOADERS
-from morphgen.checks.srdf import MATRIX_SAMPLES, read_srdf, robot_srdf_text
+from morphgen.checks.srdf import read_srdf, robot_srdf_text
 from morphgen.cli import main
 from morphgen.cli.command import read_commands
 from morphgen.encoding.robot_hash import robot_hash
@@ -434,7 +434,6 @@ def test_folders_are_written_into_the_output_folder_and_again(
 ):
     bundle = write_bundle(arm(), tmp_path / "bundle", picture=False)
     words = ["export", bundle, "--format", name, "--out", tmp_path]
-    words += ["--samples", "20"] if name == "ros2" else []
     for _ in range(2):
         code, out, _ = run(*words)
         assert (code, out.strip()) == (0, str(tmp_path / folder))
@@ -458,10 +457,10 @@ def test_an_exported_urdf_has_the_fits_and_so_the_goals_of_the_robot(run, tmp_pa
 
 def test_files_of_a_bundle_are_written_into_it(run, tmp_path):
     bundle = write_bundle(arm(), tmp_path / "a", picture=False)
-    for name, options in (("srdf", ("--samples", "30", "--seed", "2")), ("glb", ())):
-        code, out, _ = run("export", bundle, "--format", name, *options)
+    for name in ("srdf", "glb"):
+        code, out, _ = run("export", bundle, "--format", name)
         assert (code, out.strip()) == (0, str(bundle / f"robot.{name}"))
-    assert (bundle / "robot.srdf").read_text() == robot_srdf_text(arm(), samples=30, seed=2)
+    assert (bundle / "robot.srdf").read_text() == robot_srdf_text(arm())
     assert read_srdf(bundle / "robot.srdf").find("group").get("name") == "arm"
     assert (bundle / "robot.glb").read_bytes()[:4] == b"glTF"
     assert file_findings(bundle) == ()
@@ -491,16 +490,6 @@ def test_exports_of_robots_of_one_name_are_not_written_over_each_other(run, tmp_
     assert f"b: {tmp_path / 'arm-sdf'} is of another robot of this command already" in err
 
 
-def test_the_help_has_the_formats_and_the_default_number_of_samples():
+def test_the_help_has_the_formats():
     (command,) = [each for each in read_commands() if each.path == "export"]
     assert command.options["--format"]["choices"] == [*export.FILES, *export.FOLDERS]
-    assert f"default: {MATRIX_SAMPLES:,}" in command.options["--samples"]["help"]
-
-
-@pytest.mark.parametrize("name", ["srdf", "ros2"])
-def test_export_without_a_tool_is_refused_before_the_fit(tmp_path, monkeypatch, name, refused):
-    monkeypatch.setattr(export, "as_spheres", lambda *given, **_: pytest.fail("fitted"))
-    bundle = write_bundle(replace(arm(), frames=()), tmp_path / "a", picture=False)
-    words = ("--format", name, "--spheres", "2", "--out", tmp_path)
-    assert "robot 'arm' has no frame 'tool'" in refused("export", bundle, *words)
-    assert [path.name for path in tmp_path.iterdir()] == ["a"]
