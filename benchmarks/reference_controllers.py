@@ -36,7 +36,7 @@ from morphgen.grammar.library import Library, default_library
 from morphgen.model.kinematics_torch import frame_positions
 from morphgen.processes import parallel_map
 from morphgen.rl.baselines import BASELINES, baselines_for
-from morphgen.rl.baselines.simple import Zero
+from morphgen.rl.baselines.reach import Zero
 from morphgen.rl.inference import run_episodes
 from morphgen.splits.split import SIDES, Member, read_split, split_names
 from morphgen.tasks.batch import TaskBatch

@@ -20,7 +20,7 @@ from typing import TypeVar
 from tabulate import tabulate
 from tqdm import tqdm
 
-from morphgen.benchmark.generate import SplitRequest, extrapolation
+from morphgen.benchmark.regimes import SplitRequest, extrapolation
 from morphgen.benchmark.release import verify
 from morphgen.benchmark.split_folder import build_split
 from morphgen.benchmark.survey import audit

@@ -206,6 +206,8 @@ def require_types(
         text_argument(name, getattr(given, name), error)
     for name in (each for each in least if getattr(given, each) is not None):
         setattr(given, name, whole_number(name, getattr(given, name), error, least[name]))
+        if getattr(given, name) >= 2**63:  # files could not hold it
+            raise error(f"{name}: expected at most 2^63 - 1")
 
 
 def truth(name: str, value: object, error: type[MorphgenError]) -> bool:

@@ -197,7 +197,7 @@ class PPOConfig:
     compile: bool = False  # run networks and losses by `torch.compile`; on a GPU as CUDA graphs
 
     def __post_init__(self) -> None:
-        require_numbers(self, "total_timesteps", "epochs", "minibatches", low=1)
+        require_numbers(self, "total_timesteps", "epochs", "minibatches", low=1, high=10**15)
         require_numbers(self, "num_steps", low=1, high=MAX_NUM_STEPS)
         positive = ("clip_coef", "learning_rate", "adam_epsilon", "max_grad_norm")
         require_numbers(self, *positive, above=True)

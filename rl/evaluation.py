@@ -16,7 +16,7 @@ from morphgen.errors import TaskError
 from morphgen.model.kinematics import reach
 from morphgen.progress import part_of, show_progress, stage
 from morphgen.rl.baselines import BASELINES, ZERO, Controller, baselines_for
-from morphgen.rl.baselines.simple import Random
+from morphgen.rl.baselines.reach import Random
 from morphgen.rl.config import differences
 from morphgen.rl.inference import Episode, Mode, Policy, PolicyController, run_episodes
 from morphgen.rl.runs.checkpoint import Interface, RunConfig, read_checkpoint

@@ -11,13 +11,13 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, overload
 
-from morphgen.benchmark.generate import (
+from morphgen.benchmark.hold_out import hold_out
+from morphgen.benchmark.licences import LicencedPart, licenced_parts
+from morphgen.benchmark.regimes import (
     SplitRequest,
     extrapolation,
     interpolation,
 )
-from morphgen.benchmark.hold_out import hold_out
-from morphgen.benchmark.licences import LicencedPart, licenced_parts
 from morphgen.benchmark.release import build_with_goals, verify
 from morphgen.benchmark.split_folder import (
     Difference,

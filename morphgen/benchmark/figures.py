@@ -23,9 +23,7 @@ _LETTER_WIDTH = 0.075  # width of a letter of a name [inches]
 _LABEL_DISTANCES = (9, 16, 26, 40, 58, 80)
 """Distances of a name from its point, tried in turn [pixels]."""
 _MARKERS = "o^"  # markers of groups of robots: each with all colours, one after another
-_ALL_NAMED, _SOME_NAMED, _APART = 20, 30, 16.0
-"""Largest number of robots of a map that are all named; of more, number of names, and least
-distance of points that are named [pixels]."""
+_MAX_NAMED = 20  # largest number of robots of a map that are named
 _LABEL_FONT_SIZE = 7.5  # font size of the names in a map [points]
 _LABEL_DIRECTIONS = np.array(
     [(1, 0), (-1, 0), (0, 1), (0, -1), (0.8, 0.7), (-0.8, 0.7), (0.8, -0.7), (-0.8, -0.7)]
@@ -43,8 +41,8 @@ def _default_style() -> Iterator[None]:
 def map_png(names: Sequence[str], matrices: Mapping[str, Array], groups: Sequence[str]) -> bytes:
     """Draw a map for each matrix by measure, side by side, and return the PNG.
 
-    Colours and markers distinguish the largest groups of robots, which the legend names. Robots are
-    named where there is room; of many robots, some that are spread over the map.
+    Colours and markers distinguish the largest groups of robots, which the legend names. Up to 20
+    robots are named where there is room.
     """
     legend_width = 0.9 + 0.8 * _LETTER_WIDTH * max(map(len, groups))
     size = (7.0 * len(matrices) + legend_width, 7)
@@ -68,7 +66,7 @@ def map_png(names: Sequence[str], matrices: Mapping[str, Array], groups: Sequenc
         text.set_parse_math(False)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
-    for mds_map, ax in zip(maps, axes, strict=True):
+    for mds_map, ax in zip(maps, axes, strict=True) if len(names) <= _MAX_NAMED else ():
         _name_points(ax, mds_map.points, names, canvas)
     return _png(figure)
 
@@ -109,8 +107,7 @@ def _name_points(ax: Axes, points: Array, names: Sequence[str], canvas: FigureCa
     font = FontProperties(size=_LABEL_FONT_SIZE)
     centres = ax.transData.transform(points)
     taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in centres]
-    for i in range(len(names)) if len(names) <= _ALL_NAMED else _spread(centres):
-        point, centre, name = points[i], centres[i], names[i]
+    for point, centre, name in zip(points, centres, names, strict=True):
         width, height, _ = renderer.get_text_width_height_descent(name, font, ismath=False)
         position = _free_position(centre, (width, height), taken, ax.bbox)
         if position is None:
@@ -128,18 +125,6 @@ def _name_points(ax: Axes, points: Array, names: Sequence[str], canvas: FigureCa
             parse_math=False,
             arrowprops={"arrowstyle": "-", "color": "0.6", "linewidth": 0.5, "shrinkB": 3},
         )
-
-
-def _spread(points: Array) -> Iterator[int]:
-    """Yield indices of points, each of which is the farthest from those before it [pixels]."""
-    chosen = int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())
-    distance = np.full(len(points), np.inf)
-    for _ in range(_SOME_NAMED):
-        yield chosen
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen], axis=1))
-        chosen = int(distance.argmax())
-        if distance[chosen] < _APART:
-            return
 
 
 def _free_position(

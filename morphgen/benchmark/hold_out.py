@@ -16,15 +16,18 @@ from functools import partial
 from itertools import product
 from typing import TypeAlias
 
-from morphgen.benchmark.generate import (
+from morphgen.benchmark.regimes import (
     MAX_COMPOSED,
     MAX_DRAWS,
+    NOTHING,
     RobotStream,
     SplitRequest,
     assemble,
+    found,
     members,
+    parts,
+    pattern_robots,
 )
-from morphgen.benchmark.regimes import NOTHING, found, parts, pattern_robots
 from morphgen.encoding.similarity import is_near
 from morphgen.errors import BenchmarkError, nearest
 from morphgen.grammar.grammar_file import Grammar

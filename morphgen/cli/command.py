@@ -258,6 +258,8 @@ def whole_number(least: int, largest: int | None = None) -> Callable[[str], int]
         # Nan and inf fail the first condition: their remainder is nan.
         if not (number % 1 == 0 and least <= number <= (math.inf if largest is None else largest)):
             raise argparse.ArgumentTypeError(f"{text}: expected a whole number, {valid}")
+        if number >= 2**63:  # files could not hold it
+            raise argparse.ArgumentTypeError(f"{text}: expected at most 2^63 - 1")
         return int(number)
 
     return parse

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
+from decimal import Decimal
 from importlib import import_module
 from typing import Any
 
@@ -30,7 +31,9 @@ def require_numbers(
         if not low <= value <= high or (above and value == low):
             expected = f"{low} or more" if high == math.inf else f"{low} to {high}"
             expected = f"more than {low}" if above else expected
-            raise TaskError(f"{name} {value:.15g}: expected {expected}")
+            # Whole numbers may be larger than the largest float.
+            shown = Decimal(value) if isinstance(value, int) else value
+            raise TaskError(f"{name} {shown:.15g}: expected {expected}")
 
 
 @dataclass(frozen=True)

@@ -47,10 +47,10 @@ class Baseline:
         return controller
 
 
-RANDOM = Baseline("random", "morphgen.rl.baselines.simple:Random")
-ZERO = Baseline("zero", "morphgen.rl.baselines.simple:Zero")
-JACOBIAN = Baseline("jacobian", "morphgen.rl.baselines.simple:JacobianColumns", ("reach",))
-IK = Baseline("ik", "morphgen.rl.baselines.ik:InverseKinematics", ("reach",))
+RANDOM = Baseline("random", "morphgen.rl.baselines.reach:Random")
+ZERO = Baseline("zero", "morphgen.rl.baselines.reach:Zero")
+JACOBIAN = Baseline("jacobian", "morphgen.rl.baselines.reach:JacobianColumns", ("reach",))
+IK = Baseline("ik", "morphgen.rl.baselines.reach:InverseKinematics", ("reach",))
 SCRIPTED = Baseline(
     "scripted",
     "morphgen.rl.baselines.scripted_articulated:Scripted",

@@ -13,7 +13,6 @@ import zipfile
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from decimal import Decimal
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -364,28 +363,6 @@ class RunConfig:
         data = asdict(self)
         del data["tasks"]
         return data | GoalConfig(tasks=self.tasks).as_data()
-
-
-_OPTIONS = {"total_timesteps": "steps", "num_envs": "envs", "num_goals": "train-goals"}
-"""Options by the fields that they set, where the names differ."""
-
-
-def require_storable(config: RunConfig) -> None:
-    """Require numbers that a checkpoint can hold; else the run would fail when it writes one."""
-
-    def require(name: str, value: object) -> None:
-        for key, each in value.items() if isinstance(value, Mapping) else ():
-            require(str(key), each)
-        if isinstance(value, int) and value.bit_length() > MAX_INTEGER_BITS:
-            option = _OPTIONS.get(name, name).replace("_", "-")
-            largest = 2**MAX_INTEGER_BITS - 1
-            # Python refuses to print whole numbers of more than 4,300 digits.
-            raise TaskError(
-                f"--{option} {Decimal(value):.3g}: expected at most {largest} "
-                f"({Decimal(largest):.3g}), the largest whole number that a checkpoint can hold"
-            )
-
-    require("", config.as_data())
 
 
 def open_run(folder: Path, config: RunConfig, *, resume: bool) -> None:

@@ -42,7 +42,6 @@ from morphgen.rl.runs.checkpoint import (
     read_checkpoint,
     read_config,
     require_open,
-    require_storable,
     write_checkpoint,
 )
 from morphgen.rl.runs.robot_source import (
@@ -402,10 +401,9 @@ def train(
 def require_runnable(config: RunConfig) -> None:
     """Require timesteps for at least one update, and an environment for every robot.
 
-    All numbers must fit into a checkpoint. Drawn robots may have environments one after another;
+    Drawn robots may have environments one after another;
     see ``RunConfig.slice_updates``.
     """
-    require_storable(config)
     source = config.source
     robots = len(members(source)) or num_drawn(source)
     if isinstance(source, GrammarSource) and AGENTS[config.policy.agent].per_robot:

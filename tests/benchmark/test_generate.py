@@ -9,14 +9,12 @@ from scipy.spatial import Delaunay
 import morphgen
 from helpers.grammars import grammar, shipped
 from helpers.splits import LIBRARY, derivations, names, order, require_sound
-from morphgen.benchmark import generate
-from morphgen.benchmark.generate import (
-    extrapolation,
-    interpolation,
-)
+from morphgen.benchmark import regimes
 from morphgen.benchmark.regimes import (
     combination,
+    extrapolation,
     hull_distance,
+    interpolation,
     parameters,
     parts,
     regime_findings,
@@ -105,7 +103,7 @@ def test_progress_reaches_the_total():
 
 
 def test_train_robots_are_never_test_robots(monkeypatch):
-    monkeypatch.setattr(generate, "MAX_DRAWS", 50)
+    monkeypatch.setattr(regimes, "MAX_DRAWS", 50)
     few = grammar("robot -> gantry plane(size=choice(0.1, 0.2, 0.3))")
     (split,) = interpolation(order(2), few, LIBRARY)
     bodies = {m.robot_hash for m in split.train}
@@ -115,7 +113,7 @@ def test_train_robots_are_never_test_robots(monkeypatch):
 
 
 def test_an_empty_hull_is_an_error(monkeypatch):
-    monkeypatch.setattr(generate, "MAX_DRAWS", 100)
+    monkeypatch.setattr(regimes, "MAX_DRAWS", 100)
     with pytest.raises(BenchmarkError) as caught:
         interpolation(order(3), shipped("arm3"), LIBRARY, hull="inside")
     assert str(caught.value) == (
@@ -156,7 +154,7 @@ def test_extrapolation_never_tests_trained_structures(monkeypatch):
     assert trained.isdisjoint(structure(d, LIBRARY) for d in derivations(split.test))
     assert names(split.test) != ["mine-000000", "mine-000001", "mine-000002"]
     same = replace(shipped("nlink"), name="mine")
-    monkeypatch.setattr(generate, "MAX_DRAWS", 60)
+    monkeypatch.setattr(regimes, "MAX_DRAWS", 60)
     with pytest.raises(BenchmarkError, match=r"60 draws; .* had the structure of a train robot"):
         extrapolation(order(20), grammars("nlink"), [same], LIBRARY)
 

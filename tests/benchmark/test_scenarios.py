@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 
 from helpers.splits import combined
-from morphgen.benchmark.generate import stream_seed
 from morphgen.benchmark.licences import (
     UNKNOWN,
     find_licence,
@@ -15,7 +14,7 @@ from morphgen.benchmark.licences import (
     require_allowed,
     restricted,
 )
-from morphgen.benchmark.regimes import regime_findings
+from morphgen.benchmark.regimes import regime_findings, stream_seed
 from morphgen.benchmark.survey import statistics
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.grammar_file import find_grammar, load_grammar

@@ -1,7 +1,6 @@
 """Small splits that tests write in code, and requests for others."""
 
-from morphgen.benchmark.generate import SplitRequest
-from morphgen.benchmark.regimes import regime_findings
+from morphgen.benchmark.regimes import SplitRequest, regime_findings
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.grammar.compose import compose
 from morphgen.grammar.library import default_library

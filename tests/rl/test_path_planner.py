@@ -18,11 +18,10 @@ from morphgen.model.kinematics_torch import frame_pose, frame_positions
 from morphgen.model.robot import Joint, Link
 from morphgen.rl.baselines import baselines_for, path_planner
 from morphgen.rl.baselines import scripted_push as pushing
-from morphgen.rl.baselines.ik import InverseKinematics
 from morphgen.rl.baselines.path_planner import PathCost, PathFollower, PathPlanner
+from morphgen.rl.baselines.reach import GAIN, InverseKinematics, JacobianColumns, column_steps
 from morphgen.rl.baselines.scripted_articulated import Scripted
 from morphgen.rl.baselines.scripted_push import Push, PushPlanner, ScriptedPush, ToolKinematics
-from morphgen.rl.baselines.simple import GAIN, JacobianColumns, column_steps
 from morphgen.rl.inference import run_episodes
 from morphgen.splits.split import read_split
 from morphgen.tasks.actions import encode_actions

@@ -18,7 +18,7 @@ from helpers.scenes import robot
 from morphgen.errors import TaskError
 from morphgen.rl import ppo
 from morphgen.rl import scores as scoring
-from morphgen.rl.baselines.simple import Zero
+from morphgen.rl.baselines.reach import Zero
 from morphgen.rl.config import PolicyConfig, PPOConfig
 from morphgen.rl.inference import make_env_and_controller, play, read_controller, run_episodes
 from morphgen.rl.ppo import Learner, gae, matching_loss, symexp, symlog

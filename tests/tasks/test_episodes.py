@@ -11,9 +11,8 @@ from helpers.device_reads import device_reads
 from helpers.goal_sets import draw_spec
 from helpers.scenes import robot
 from morphgen.errors import TaskError
-from morphgen.rl.baselines import ik
-from morphgen.rl.baselines.ik import InverseKinematics
-from morphgen.rl.baselines.simple import Random, Zero
+from morphgen.rl.baselines import reach as reach_baselines
+from morphgen.rl.baselines.reach import InverseKinematics, Random, Zero
 from morphgen.rl.inference import STEPS_UNREAD, run_episodes
 from morphgen.tasks.actions import BINS, encode_actions
 from morphgen.tasks.batch import TaskBatch
@@ -373,7 +372,7 @@ def test_baselines_plan_around_the_current_obstacles(build_layouts, monkeypatch)
         scenes.append(scene.obstacles)
         return FreeSpace(scene)
 
-    monkeypatch.setattr(ik, "FreeSpace", recorded)
+    monkeypatch.setattr(reach_baselines, "FreeSpace", recorded)
     for _ in range(6):
         batch.reset()
         controller.act(batch)
