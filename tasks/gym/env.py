@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from morphgen.errors import TaskError
+from morphgen.errors import TaskError, nearest, whole_number
 from morphgen.grammar.robot_source import RobotLike
 from morphgen.model.kinematics import FramePosition, frame_pose
 from morphgen.tasks.actions import ActionDecoder, JointMotion
@@ -29,18 +29,16 @@ from morphgen.tasks.gym.vector import (
     NumpyObservation,
     action_space,
     batch_options,
+    episode_limit,
     numpy_observation,
     observation_space,
-    render_arguments,
-    require_limit,
 )
 from morphgen.tasks.observation import LinkJoints, LinkTokens, Observation
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
-from morphgen.tasks.renderer import SIZE, Frame
+from morphgen.tasks.renderer import SIZE, Frame, Renderer, render_state
 from morphgen.tasks.rows import numpy_row
-from morphgen.tasks.scenes.env_specs import GoalConfig
 from morphgen.tasks.scenes.make import make_batch
-from morphgen.tasks.sim.base import Contacts
+from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
 from morphgen.tasks.task import STANDARD_FIELDS, StepFormulas, StepResult, TaskConfig
 
 EnvStep = tuple[NumpyObservation, float, bool, bool, dict[str, Any]]
@@ -152,6 +150,19 @@ def _info(result: StepResult[Any], diverged: bool) -> dict[str, Any]:
     return info
 
 
+def render_arguments(render_mode: str | None, size: tuple[int, int]) -> tuple[int, int]:
+    """Return a valid size of pictures [pixels]."""
+    if render_mode is not None and render_mode not in _RENDER_MODES:
+        hint = nearest(render_mode, _RENDER_MODES)
+        raise TaskError(f"unknown render mode {render_mode!r}{hint}")
+    try:
+        width, height = (whole_number("size", pixels, TaskError, 1) for pixels in size)
+    except (TypeError, ValueError) as error:
+        raise TaskError(f"size {size!r}: expected width and height [pixels]") from error
+    return width, height
+
+
+_RENDER_MODES = ("rgb_array",)
 _OPTIONS = OPTIONS - {"workers", "device", "seed", "first", "configs"}
 
 
@@ -183,6 +194,11 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         action_links: Indices of the links of these joints, which are rows of the tokens.
     """
 
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": list(_RENDER_MODES),
+        "render_fps": round(1 / CONTROL_PERIOD),
+    }
+
     def __init__(
         self,
         task: str,
@@ -197,16 +213,16 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
 
         The arguments are those of ``make_batch``; pictures have a width and a height [pixels].
         """
-        render_arguments(render_mode, size)
+        self._size, self.render_mode = render_arguments(render_mode, size), render_mode
+        self._renderer: Renderer | None = None
         options = batch_options("one environment", task, config, options, _OPTIONS)
         sim = SIMULATORS[options.get("sim") or DEFAULT_SIMULATOR]
         contacts: Contacts = options["contacts"] or Contacts()
         self._self_collision = contacts.self_collision and sim.simulates_contacts
-        limit = GoalConfig(tasks=options.get("configs", ())).task_config(task).max_episode_steps
-        require_limit(_limit_for_make(), limit)
+        episode_limit(_limit_for_make(), task, options)
         self.task = task
         batch = make_batch(task, [robot], 1, **options)
-        self._wrap(batch, render_mode, size)
+        self._wrap(batch)
         self.env_spec = batch.specs[0]
         robot_links = self.env_spec.robot.joints
         fields = TASKS[task].fields
@@ -253,13 +269,22 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
 
     def render(self) -> Frame | None:
         """Return a picture, shape (height, width, 3), if ``render_mode`` is ``rgb_array``."""
-        frames = self._frames()
-        return None if frames is None else frames[0]
+        self._require_open()
+        if self.render_mode is None:
+            gym.logger.warn(
+                'nothing is rendered: make the environment with render_mode="rgb_array"'
+            )
+            return None
+        if self._renderer is None:
+            self._renderer = Renderer.of_spec(self.env_spec, self._size)
+        return self._renderer.frame(render_state(self.batch))
 
     def close(self) -> None:
         """Free everything; a second call does nothing."""
         self.closed = True
-        self._free()
+        self.batch.close()
+        if self._renderer is not None:
+            self._renderer.close()
 
     def _without_padding(self, observation: Observation) -> NumpyObservation:
         """Return the observation of a batch of one without padding, masks and foreign fields."""

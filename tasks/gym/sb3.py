@@ -95,8 +95,8 @@ class SB3Vector(VecEnv):
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """Return a picture of each environment; None without ``render_mode``."""
-        return self.vector.render() or [None] * self.num_envs
+        """Return no picture: single environments draw theirs."""
+        return [None] * self.num_envs
 
     def _require_all(self, name: str, indices: Indices) -> None:
         if list(self._get_indices(indices)) != list(range(self.num_envs)):

@@ -7,7 +7,6 @@ from dataclasses import replace
 from inspect import signature
 from typing import Any, TypeVar
 
-import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -22,16 +21,14 @@ from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.observation import Observation, ObservationConfig
 from morphgen.tasks.registry import KINEMATIC_CHANNELS, TASKS, register_gym_envs
-from morphgen.tasks.renderer import SIZE, Frame, Renderer, render_state
-from morphgen.tasks.scenes.env_specs import task_configs
+from morphgen.tasks.scenes.env_specs import GoalConfig, task_configs
 from morphgen.tasks.scenes.make import BatchOptions, make_batch
-from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
+from morphgen.tasks.sim.base import Contacts
 from morphgen.tasks.task import BOUND, TaskConfig
 
 register_gym_envs()  # morphgen.tasks may have been imported before Gymnasium
 
 T = TypeVar("T")
-RENDER_MODES = ("rgb_array",)
 LINK_ENTRIES = ("tokens", "velocity", *KINEMATIC_CHANNELS)
 """Entries of observations with a row for each link."""
 _INFO_KEYS = ("success", "distance", "score", "diverged")
@@ -76,25 +73,17 @@ def action_space(kind: str, actions: int) -> spaces.Box | spaces.MultiDiscrete:
     return spaces.MultiDiscrete([len(BINS)] * actions)
 
 
-def render_arguments(render_mode: str | None, size: tuple[int, int]) -> tuple[int, int]:
-    """Return a valid size of pictures [pixels]."""
-    if render_mode is not None and render_mode not in RENDER_MODES:
-        hint = nearest(render_mode, RENDER_MODES)
-        raise TaskError(f"unknown render mode {render_mode!r}{hint}")
-    try:
-        width, height = (whole_number("size", pixels, TaskError, 1) for pixels in size)
-    except (TypeError, ValueError) as error:
-        raise TaskError(f"size {size!r}: expected width and height [pixels]") from error
-    return width, height
-
-
-def require_limit(given: int | None, limit: int) -> None:
-    """Require a ``max_episode_steps`` of ``gym.make`` below the task's own limit."""
-    if given is not None and given > limit:
+def episode_limit(given: int | None, task: str, options: Mapping[str, Any]) -> int:
+    """Return the ``max_episode_steps`` of ``gym.make``, or else the task's own, which is larger."""
+    limit = GoalConfig(tasks=options.get("configs", ())).task_config(task).max_episode_steps
+    if given is None:
+        return limit
+    if whole_number("max_episode_steps", given, TaskError, 1) > limit:
         raise TaskError(
             f"max_episode_steps {given}: episodes end after {limit} control steps; for longer ones "
             f"pass a config of the task with max_episode_steps={given}"
         )
+    return given
 
 
 def from_mapping(
@@ -146,26 +135,19 @@ def batch_options(
 
 
 class BatchEnv:
-    """Pictures of a Gymnasium environment, single or a vector.
+    """What single environments and vectors have in common.
 
     Attributes:
         batch: The batch, which it owns.
         max_episode_steps: Time limit of episodes, of the longest if tasks differ [control steps].
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012
-        "render_modes": list(RENDER_MODES),
-        "render_fps": round(1 / CONTROL_PERIOD),
-    }
     batch: TaskBatch
     max_episode_steps: int
     closed = False
 
-    def _wrap(self, batch: TaskBatch, render_mode: str | None, size: tuple[int, int]) -> None:
-        """Wrap a batch; pictures have a width and a height [pixels]."""
+    def _wrap(self, batch: TaskBatch) -> None:
         self.batch, self.max_episode_steps = batch, int(batch.max_episode_steps.max())
-        self._size, self.render_mode = render_arguments(render_mode, size), render_mode
-        self._renderers: dict[int, Renderer] = {}
         self._spec: EnvSpec | None = None
         self._running = False
 
@@ -193,26 +175,6 @@ class BatchEnv:
         if not self._running:
             raise TaskError("no episode is running; call reset()")
 
-    def _frames(self) -> tuple[Frame, ...] | None:
-        """Return a picture of each environment."""
-        self._require_open()
-        if self.render_mode is None:
-            gym.logger.warn(
-                'nothing is rendered: make the environment with render_mode="rgb_array"'
-            )
-            return None
-        frames = []
-        for env, robot in enumerate(self.batch.env_robot_index.tolist()):
-            if robot not in self._renderers:
-                self._renderers[robot] = Renderer.of_spec(self.batch.specs[robot], self._size)
-            frames.append(self._renderers[robot].frame(render_state(self.batch, env)))
-        return tuple(frames)
-
-    def _free(self) -> None:
-        self.batch.close()
-        for renderer in self._renderers.values():
-            renderer.close()
-
 
 class TaskVector(BatchEnv, VectorEnv[NumpyObservation, Array, Array]):
     """A batch with a NumPy interface. It owns the batch: ``close`` frees it.
@@ -235,17 +197,10 @@ class TaskVector(BatchEnv, VectorEnv[NumpyObservation, Array, Array]):
         action_links: Links whose joints the entries of an action move, K indices below L.
     """
 
-    metadata = BatchEnv.metadata | {"autoreset_mode": AutoresetMode.SAME_STEP}
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
-    def __init__(
-        self,
-        batch: TaskBatch,
-        *,
-        render_mode: str | None = None,
-        size: tuple[int, int] = SIZE,
-    ) -> None:
-        """Wrap a batch; pictures have a width and a height [pixels]."""
-        self._wrap(batch, render_mode, size)
+    def __init__(self, batch: TaskBatch) -> None:
+        self._wrap(batch)
         self.num_envs = batch.num_envs
         has_action, is_link = batch.action_mask.any(dim=0), batch.observe()["links"].any(dim=0)
         self.action_links: tuple[int, ...] = tuple(torch.nonzero(has_action)[:, 0].tolist())
@@ -299,13 +254,9 @@ class TaskVector(BatchEnv, VectorEnv[NumpyObservation, Array, Array]):
         observation, reward = self._numpy(step.observation), _numpy(step.reward)
         return observation, reward, terminated, truncated, infos
 
-    def render(self) -> tuple[Frame, ...] | None:
-        """Return a picture of each environment if ``render_mode`` is ``rgb_array``."""
-        return self._frames()
-
     def close_extras(self, **kwargs: object) -> None:
         """Free the batch."""
-        self._free()
+        self.batch.close()
 
     def _padded(self, actions: Array) -> torch.Tensor:
         """Return actions for all links, shape (n, L)."""
@@ -335,25 +286,16 @@ def task_vector(
     robots: Sequence[RobotLike] = (),
     config: TaskConfig | Mapping[str, Any] | None = None,
     max_episode_steps: int | None = None,
-    render_mode: str | None = None,
-    size: tuple[int, int] = SIZE,
     **options: Any,  # noqa: ANN401
 ) -> TaskVector:
     """Make a vector environment for ``gymnasium.make_vec("morphgen/Reach-v0", num_envs, ...)``."""
     options = batch_options("vector environments", task, config, options, OPTIONS)
     if options.get("seed") is None:
         options["seed"] = int(np.random.default_rng().integers(2**63))
-    render_arguments(render_mode, size)
+    limit = episode_limit(max_episode_steps, task, options)
     batch = make_batch(task, robots or [robot], num_envs, **options)
-    try:
-        if max_episode_steps is not None:
-            require_limit(max_episode_steps, int(batch.max_episode_steps.max()))
-            whole_number("max_episode_steps", max_episode_steps, TaskError, 1)
-            batch.max_episode_steps.clamp_(max=max_episode_steps)
-        return TaskVector(batch, render_mode=render_mode, size=size)
-    except TaskError:
-        batch.close()
-        raise
+    batch.max_episode_steps.clamp_(max=limit)
+    return TaskVector(batch)
 
 
 def _infos(step: Step, where: Array) -> dict[str, Any]:
