@@ -59,7 +59,7 @@ def folder(tmp_path_factory):
     return root
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def files(folder):
     """The files of a viewer in the folder."""
     return FileAccess(default_library().folders, (folder.resolve(),), folder / "none")

@@ -19,8 +19,6 @@ from helpers.runs import QUIET, small_config
 from helpers.viser_client import PlainClient
 from helpers.worker_functions import die_later, power, sleep_from
 from morphgen.errors import MorphgenError, SimulationError, TaskError
-from morphgen.formats.bundle import write_bundle
-from morphgen.grammar.library import default_library
 from morphgen.rl.baselines import baselines_for
 from morphgen.rl.inference import make_env_and_controller, play, read_controller
 from morphgen.rl.runs.training import train
@@ -29,24 +27,11 @@ from morphgen.viewer.app.address import AddressError, parse_address
 from morphgen.viewer.app.workers import SharedResults, WorkerDied, Workers
 from morphgen.viewer.pages.play import SIMULATOR_NAMES, curves, default_policy, parse_time
 from morphgen.viewer.robot_files import scene_server
-from morphgen.viewer.robot_uri import FileAccess
 from morphgen.viewer.rollout import Player, RemoteRollout, RolloutConfig, score_until
 from morphgen.viewer.scene import rollout as drawing
 from morphgen.viewer.simulation import Rollout
 
-CUBE = "words:base=planar ee=cube"
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory):
-    root = tmp_path_factory.mktemp("here").resolve()
-    write_bundle(arm(), root / "robots" / "one", picture=False)
-    return root
-
-
-@pytest.fixture(scope="module")
-def files(root):
-    return FileAccess(default_library().folders, (root,), root / "none")
+CUBE, ARM = "words:base=planar ee=cube", "robots/some-arm"
 
 
 def simulated(config, files):
@@ -61,7 +46,7 @@ def simulated(config, files):
 @pytest.fixture(scope="module")
 def episode(files, module_cache):
     """An episode of two reach robots: one composed, one from a bundle."""
-    return simulated(RolloutConfig("reach", (CUBE, "robots/one"), "jacobian", 3), files)
+    return simulated(RolloutConfig("reach", (CUBE, ARM), "jacobian", 3), files)
 
 
 @pytest.mark.slow
@@ -89,7 +74,7 @@ def test_a_rollout_of_the_process_of_simulations_is_the_same(episode, files, mod
         return submit(work, *arguments).result()
 
     process = SimpleNamespace(submit=submit, result=Future.result, call=call)
-    config = RolloutConfig("reach", (CUBE, "robots/none", "robots/one"), "jacobian", 3)
+    config = RolloutConfig("reach", (CUBE, "robots/none", ARM), "jacobian", 3)
     remote = RemoteRollout(config, files, process)
     assert (list(remote.faults), remote.max_steps) == (["robots/none"], 300)
     assert remote.episode.num_steps == 0
@@ -114,10 +99,10 @@ def test_score_counts_the_steps_so_far(episode):
     assert score_until(track, "push", 2) == track.score[1]
 
 
-def test_a_policy_gets_the_observations_it_was_trained_with(root, files, module_cache):
+def test_a_policy_gets_the_observations_it_was_trained_with(folder, files, module_cache):
     config = small_config(total_timesteps=32)
     config = replace(config, policy=replace(config.policy, tool_position=True))
-    train(root / "run", config, execution=QUIET)
+    train(folder / "run", config, execution=QUIET)
     rollout = Rollout(RolloutConfig("reach", (CUBE,), "run"), files)
     assert rollout.faults == {}
     assert rollout.advance()
@@ -129,12 +114,18 @@ def test_a_policy_gets_the_observations_it_was_trained_with(root, files, module_
     [
         (RolloutConfig("reach", (), "zero"), "no robot is named"),
         (RolloutConfig("reach", ("robots/none",), "zero"), "no such file"),
-        (RolloutConfig("reach", ("robots/one",), "scripted"), "is for push or .* not for reach"),
-        (RolloutConfig("push", ("robots/one",), "ik"), "is for reach, not for push"),
-        (RolloutConfig("reach", ("robots/one",), "zeros"), "did you mean 'zero'"),
-        (RolloutConfig("reach", ("robots/one",), "../x.pt"), "outside of the folders"),
-        (RolloutConfig("reach", ("robots/one",), "x.pt"), "no such file"),
-        (RolloutConfig("reach", ("robots/one",), "robots/one/robot.urdf"), "is not a checkpoint"),
+        (
+            RolloutConfig("reach", (ARM,), "scripted"),
+            "is for push or .* not for reach",
+        ),
+        (RolloutConfig("push", (ARM,), "ik"), "is for reach, not for push"),
+        (RolloutConfig("reach", (ARM,), "zeros"), "did you mean 'zero'"),
+        (RolloutConfig("reach", (ARM,), "../x.pt"), "outside of the folders"),
+        (RolloutConfig("reach", (ARM,), "x.pt"), "no such file"),
+        (
+            RolloutConfig("reach", (ARM,), f"{ARM}/robot.urdf"),
+            "is not a checkpoint",
+        ),
     ],
 )
 def test_an_invalid_rollout_is_rejected(files, module_cache, config, why):
