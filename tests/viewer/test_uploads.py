@@ -79,22 +79,6 @@ def test_a_damaged_zip_is_rejected(access, how):
     assert list(access.uploads.iterdir()) == []
 
 
-def test_zips_of_large_files_are_rejected(access, monkeypatch):
-    monkeypatch.setattr(uploads, "LIMITS", replace(uploads.LIMITS, max_bytes=1000))
-    bomb = archive({"a.urdf": URDF, "b.stl": b"0" * 5000}, zipfile.ZIP_DEFLATED)
-    assert len(bomb) < 1000
-    with pytest.raises(UploadError, match="unpacks to more"):
-        store_upload("a.zip", bomb, access)
-    assert list(access.uploads.iterdir()) == []
-
-
-def test_zip_cannot_unpack_to_more_than_its_declared_size(access):
-    whole = archive({"a.urdf": URDF, "b.stl": b"0" * 5_000_000}, zipfile.ZIP_DEFLATED)
-    small = (10).to_bytes(4, "little")
-    with pytest.raises(UploadError, match="not a readable zip"):
-        store_upload("a.zip", whole.replace((5_000_000).to_bytes(4, "little"), small), access)
-
-
 XACRO = b"""<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"><link name="a"/>
 <xacro:property name="x" value="${python.vars(python.type(xacro.load_yaml))}"/></robot>"""
 
@@ -260,25 +244,11 @@ def test_uploads_come_through_a_websocket_and_are_read(shared_viewer, tmp_path):
         client.until(lambda: "see it" in client.text)
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "why"),
-    [
-        ("a.zip", archive({"a.urdf": XACRO}), "a.urdf:2: is a xacro"),
-        ("../../a" + "b" * 10_000 + ".urdf", URDF, "invalid file name"),
-    ],
-)  # fmt: skip
-def test_hostile_upload_is_rejected_with_a_message(shared_viewer, quiet, name, content, why):
-    before = set(shared_viewer.files.uploads.iterdir())
-    with PlainClient(shared_viewer.port) as client:
-        client.upload(name, content)
-        client.shows(why)
-        assert tempfile.gettempdir() not in client.text
-        assert set(shared_viewer.files.uploads.iterdir()) == before
-
-
 def test_upload_that_differs_from_its_announcement_is_dropped(viewer, quiet):
     on = viewer()
     with PlainClient(on.port) as client:
+        client.upload("../../a" + "b" * 10_000 + ".urdf", URDF)
+        client.shows("invalid file name")
         client.upload("a.urdf", b" " * 2000, size=1000)
         client.shows("longer than its announced size")
         client.upload("a.urdf", b"", size=200 * 2**20, parts=1)
@@ -289,6 +259,7 @@ def test_upload_that_differs_from_its_announcement_is_dropped(viewer, quiet):
         client.shows("10 bytes in 1000000000 parts")
         client.upload("a.urdf", URDF)
         assert client.sent_to().startswith("?robot=upload:")
+        assert len(list(on.files.uploads.iterdir())) == 1
         ((_, session),) = on.sessions.items()
         assert session.client.gui._current_file_upload_states == {}
 
