@@ -72,13 +72,12 @@ def compose(
             ``chain beads=5``.
         name: Name of the robot; by default it is made from the parts.
         geometry: Collision shapes: ``mesh`` for those of the parts; ``primitive`` for fitted boxes,
-            cylinders and spheres in place of meshes; ``convex`` for convex pieces of meshes; or
-            ``sphere`` for 8 spheres for each link.
+            cylinders and spheres in place of meshes; ``convex`` for convex pieces of meshes.
         library: Folders of your own parts and grammars.
         **words: More ``key=value`` words. Values without a unit are in SI units.
 
     Raises:
-        MissingDependencyError: If primitives or spheres have to be fitted and the extra ``fit`` is
+        MissingDependencyError: If primitives have to be fitted and the extra ``fit`` is
             missing, or meshes decomposed and the extra ``convex``.
         MorphgenError: If a part, parameter, port or grammar does not exist or does not fit, or a
             value is out of range; the message lists what is valid.

@@ -1,4 +1,4 @@
-"""Replace the collision shapes of a robot: by fitted primitives, by spheres, or by convex pieces.
+"""Replace the collision shapes of a robot: by fitted primitives, or by convex pieces.
 
 Simulators collide the convex hull of a mesh, which fills its concave places. CoACD cuts the mesh
 where its hull encloses most empty space (Wei, Liu, Ling and Su, "Approximate convex decomposition
@@ -25,7 +25,7 @@ import numpy as np
 from platformdirs import user_cache_path
 
 from morphgen.checks.self_collision import survey_collisions
-from morphgen.errors import FitError, FormatError, nearest, one_line
+from morphgen.errors import FitError, FormatError, one_line
 from morphgen.files import keep_file
 from morphgen.formats.files import replacing_folder
 from morphgen.formats.fits import (
@@ -40,7 +40,7 @@ from morphgen.formats.fits import (
     shapes_scale,
 )
 from morphgen.formats.rounding import as_written
-from morphgen.model.geometry import Mesh, Shape, Sphere, StoredFit, StoredFits
+from morphgen.model.geometry import Mesh, Shape, StoredFit, StoredFits
 from morphgen.model.mesh import convex_hull, is_flat, load_mesh
 from morphgen.model.robot import Link, Robot
 from morphgen.progress import report
@@ -53,21 +53,18 @@ if TYPE_CHECKING:
     from morphgen.fitting.robot_fit import FitReport
 
 _LOGGER = logging.getLogger(__name__)
-SPHERES = 8  # number of spheres per link
-_CACHE, _SPHERE_CACHE = "fits-3", f"spheres-2-{SPHERES}"
-"""Folders in the user's cache; the numbers rise when the same shapes get other primitives."""
-Geometry = Literal["mesh", "primitive", "convex", "sphere"]
+_CACHE = "fits-3"
+"""Folder in the user's cache; the number rises when the same shapes get other primitives."""
+Geometry = Literal["mesh", "primitive", "convex"]
 """Collision shapes of a robot. ``mesh``: those of its parts, with meshes whose hulls simulators
 collide. In place of meshes, ``primitive``: fitted boxes, cylinders and spheres; ``convex``: convex
-pieces. ``sphere``: spheres in place of all shapes."""
+pieces."""
 GEOMETRIES: tuple[Geometry, ...] = get_args(Geometry)
 
 
 def with_geometry(robot: Robot, geometry: str, folders: Sequence[Path]) -> Robot:
     """Return the robot with the collision shapes of a geometry."""
-    if geometry not in GEOMETRIES:
-        raise FitError(f"unknown geometry {geometry!r}{nearest(geometry, GEOMETRIES)}")
-    changes = {"primitive": as_primitives, "convex": as_convex, "sphere": as_spheres}
+    changes = {"primitive": as_primitives, "convex": as_convex}
     return changes[geometry](robot, folders) if geometry in changes else robot
 
 
@@ -79,54 +76,20 @@ def as_primitives(robot: Robot, folders: Sequence[Path]) -> Robot:
     """
     fits = _known_fits(robot, read_stored_fits(folders))
     if missing := _meshed_links(robot, fits):
-        fits |= _cached_fits(missing, _CACHE)
+        fits |= _cached_fits(missing)
     if missing := _meshed_links(robot, fits):
-        from morphgen.fitting.robot_fit import COLLISION_OPTIONS  # needs the extra fit
-
-        fits |= _fit_and_keep(robot, missing, COLLISION_OPTIONS, _CACHE, {})
-    return _with_provenance(robot, fits, {"fitter": FITTER_VERSION})
-
-
-def as_spheres(robot: Robot, folders: Sequence[Path]) -> Robot:
-    """Return the robot with spheres as its collision shapes, from the user's cache or a new fit.
-
-    A link of spheres keeps them. The pairs whose contacts are ignored are determined again.
-    """
-    from morphgen.fitting.link_fit import FitOptions  # needs the extra fit
-
-    stored = read_stored_fits(folders)
-    links = [link for link in robot.links if link.collisions]
-    others = [link for link in links if not has_only_spheres(link.collisions)]
-    fits = _cached_fits(others, _SPHERE_CACHE)
-    if missing := [link for link in others if link.name not in fits]:
-        fits |= _fit_and_keep(robot, missing, FitOptions(spheres=SPHERES), _SPHERE_CACHE, stored)
-    for link in links:
-        if has_only_spheres(link.collisions) and (fit := find_fit(link.collisions, robot, stored)):
-            fits[link.name] = fit
-    settings = {"fitter": FITTER_VERSION, "spheres": SPHERES, "cover": None}
-    return _with_provenance(robot, fits, settings)
-
-
-def _with_provenance(
-    robot: Robot, fits: Mapping[str, StoredFit], settings: Mapping[str, object]
-) -> Robot:
-    """Return the robot with the collision shapes of fits, which it carries, and says how."""
+        fits |= _fit_and_keep(robot, missing)
     fitted = with_primitives(robot, {link: fit.collision for link, fit in fits.items()})
-    provenance = {**fitted.provenance, "primitives": settings}
+    provenance = {**fitted.provenance, "primitives": {"fitter": FITTER_VERSION}}
     return replace(with_fits(fitted, fits), provenance=provenance)
 
 
-def has_only_spheres(shapes: Sequence[Shape]) -> bool:
-    """Return whether there are shapes, and all are spheres."""
-    return bool(shapes) and all(isinstance(shape.geometry, Sphere) for shape in shapes)
-
-
-def _cached_fits(links: Iterable[Link], kind: str) -> dict[str, StoredFit]:
+def _cached_fits(links: Iterable[Link]) -> dict[str, StoredFit]:
     """Return the fits of links with collision shapes that are in the cache, by link name."""
     fits = {}
     for link in links:
         key = shapes_key(link.collisions)
-        path = _path(kind, key)
+        path = _path(key)
         if not path.is_file():
             continue
         try:
@@ -138,30 +101,28 @@ def _cached_fits(links: Iterable[Link], kind: str) -> dict[str, StoredFit]:
     return fits
 
 
-def _fit_and_keep(
-    robot: Robot, links: Sequence[Link], options: FitOptions, kind: str, stored: StoredFits
-) -> dict[str, StoredFit]:
+def _fit_and_keep(robot: Robot, links: Sequence[Link]) -> dict[str, StoredFit]:
     """Fit links with collision shapes, say so, keep the fits in the cache, and return them."""
-    from morphgen.fitting.robot_fit import fit_links, fits_of  # needs the extra fit
+    from morphgen.fitting.robot_fit import COLLISION_OPTIONS, fit_links, fits_of  # the extra fit
 
     _LOGGER.warning(
         "fitting primitives to %d links of robot %r; the fits are kept", len(links), robot.name
     )
-    report = fit_links(robot, options, only=[link.name for link in links])
+    report = fit_links(robot, COLLISION_OPTIONS, only=[link.name for link in links])
     for finding in report.findings:
         if finding.severity != "info":
             raise FitError(f"{finding.where}: {finding.why}")
-    fits = fits_of(robot, report, stored)
+    fits = fits_of(robot, report, {})
     for name, fit in fits.items():
         shapes = robot.link(name).collisions
         key = shapes_key(shapes)
         text = fits_text({key: fit.scaled(1 / shapes_scale(shapes))})
-        keep_file(_path(kind, key), text, "fits")
+        keep_file(_path(key), text, "fits")
     return fits
 
 
-def _path(kind: str, key: str) -> Path:
-    return user_cache_path("morphgen") / kind / f"{key}.json"
+def _path(key: str) -> Path:
+    return user_cache_path("morphgen") / _CACHE / f"{key}.json"
 
 
 def _meshed_links(robot: Robot, fits: Mapping[str, StoredFit]) -> list[Link]:

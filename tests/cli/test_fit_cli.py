@@ -178,10 +178,3 @@ def test_exports_have_the_spheres_of_the_robot(ok, balls, tmp_path):
         for link in srdf.iterfind("link_sphere_approximation")
     }
     assert read == {link: spheres for link, spheres in expected.items() if spheres}
-
-
-@pytest.mark.slow
-def test_compose_gives_all_links_spheres(ok, tmp_path):
-    ok("compose", "base=planar", "ee=cube", "--geometry", "sphere", "--no-picture", "--out", ".")
-    spheres = spheres_of(read_bundle(tmp_path / "planar-cube"))
-    assert {len(of_link) for of_link in spheres.values() if of_link} == {8}

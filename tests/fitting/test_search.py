@@ -14,7 +14,7 @@ from helpers.robots import arm
 from morphgen.errors import FitError
 from morphgen.fitting import search
 from morphgen.fitting.link_fit import FitOptions, fit_shapes, quality, signed_distance
-from morphgen.fitting.replace_collision import as_spheres, has_only_spheres
+from morphgen.fitting.replace_collision import fit_robot
 from morphgen.fitting.solid import solid_of, solid_of_mesh
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.geometry import (
@@ -207,52 +207,22 @@ def test_invalid_options_are_refused(options, message):
         FitOptions(**options)
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """A robot of a mesh in millimetres, a rod and a link without shapes, and its spheres."""
-    folder = tmp_path_factory.mktemp("spheres")
-    trimesh.creation.box((100.0, 100.0, 40.0)).export(folder / "block.stl")
-    block = Shape(Mesh(folder / "block.stl", (1e-3, 1e-3, 1e-3)))
+def test_robots_get_spheres_and_keep_everything_else(tmp_path):
+    """A robot of a mesh in millimetres, a rod and a link without shapes."""
+    trimesh.creation.box((100.0, 100.0, 40.0)).export(tmp_path / "block.stl")
+    block = Shape(Mesh(tmp_path / "block.stl", (1e-3, 1e-3, 1e-3)))
     base, upper, lower, *_ = arm().links
     links = (replace(base, collisions=(block,)), upper, replace(lower, collisions=()))
-    robot = replace(arm(), links=links, joints=arm().joints[:2], frames=(), home=(0.4, 0.5))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(folder))
-        yield robot, as_spheres(robot, ())
-
-
-@pytest.fixture
-def no_search(monkeypatch):
-    def forbidden(*_, **__):
-        raise AssertionError("links were fitted again")
-
-    monkeypatch.setattr("morphgen.fitting.robot_fit.fit_links", forbidden)
-
-
-def test_robots_get_spheres_and_keep_everything_else(made):
-    meshed, robot = made
-    assert [len(link.collisions) for link in robot.links] == [8, 8, 0]
-    assert all(has_only_spheres(link.collisions) for link in robot.links[:2])
+    meshed = replace(arm(), links=links, joints=arm().joints[:2], frames=(), home=(0.4, 0.5))
+    robot = fit_robot(meshed, FitOptions(spheres=3, cover=0.9)).robot
+    assert [len(link.collisions) for link in robot.links] == [3, 3, 0]
     for before, after in zip(meshed.links, robot.links, strict=True):
         assert after.inertial.mass == pytest.approx(before.inertial.mass)
         assert len(after.visuals) == len(before.visuals)
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (20_000, 3)) * (0.1, 0.1, 0.04)
-    assert covered_by(spheres_of(robot.root.collisions), points).mean() > 0.85
-
-
-def test_spheres_are_fitted_once(made, no_search):
-    meshed, robot = made
-    again = as_spheres(meshed, ())
-    assert again.ignore_pairs == robot.ignore_pairs
-    for kept in (again, as_spheres(robot, ())):  # links of spheres keep them
-        assert [link.collisions for link in kept.links] == [link.collisions for link in robot.links]
-
-
-def test_tokens_of_a_robot_with_spheres_are_those_of_its_shapes(made):
-    meshed, robot = made
-    tokens = token_shapes(meshed)
-    assert token_shapes(robot) == tokens
-    assert token_shapes(as_spheres(robot, ())) == tokens
+    assert 0.89 < covered_by(spheres_of(robot.root.collisions), points).mean() < 0.96
+    assert fit_robot(robot, FitOptions(spheres=5)).robot.links == robot.links  # they keep spheres
+    assert token_shapes(robot) == token_shapes(meshed)
 
 
 BLOCK = Shape(Box((0.4, 0.2, 0.1)))
