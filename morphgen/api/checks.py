@@ -7,9 +7,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from morphgen import checks
-from morphgen.checks.conformance import ConformanceReport, compare, compare_file, hold_files
-from morphgen.checks.readers import loader_copy
-from morphgen.formats.bundle import CARD, bundle_folder, file_findings, read_bundle, write_bundle
+from morphgen.checks.conformance import ConformanceReport, compare_file, conformance
+from morphgen.formats.bundle import CARD, bundle_folder, file_findings, write_bundle
 from morphgen.formats.resolve import default_finder
 from morphgen.formats.urdf.read import UnsoundError
 from morphgen.grammar.library import Library, LibraryFolders, default_library
@@ -146,7 +145,7 @@ def conform_source(
 ) -> ConformanceReport:
     """Compare loaders and simulators on a file, and on its bundle; see ``conform``."""
     if source.path is not None and (source.path / CARD).is_file():
-        return _conform_bundle(source.path, samples, seed)
+        return conformance(source.path, samples, seed, holds=True)
     # First the bundle that morphgen makes of the file, then the file as it is.
     report = _conform_robot(read_source(source, library, root), samples, seed)
     if source.path is None or source.path.is_dir():
@@ -159,13 +158,4 @@ def _conform_robot(robot: Robot, samples: int, seed: int) -> ConformanceReport:
     with TemporaryDirectory() as folder:  # loaders read files
         bundle = bundle_folder(Path(folder), robot.name)
         write_bundle(robot, bundle, checks.check(robot), picture=False)
-        return _conform_bundle(bundle, samples, seed)
-
-
-def _conform_bundle(bundle: Path, samples: int, seed: int) -> ConformanceReport:
-    robot = read_bundle(bundle)
-    with loader_copy(bundle) as folder:
-        report = compare(robot, folder, samples, seed)
-        holds = hold_files(robot, folder)
-    passed = report.passed and all(row.passed is not False for row in holds)
-    return replace(report, passed=passed, holds=holds)
+        return conformance(bundle, samples, seed, holds=True)

@@ -126,15 +126,20 @@ class ConformanceReport:
     """The simulators in which the robot holds its home configuration."""
 
 
-def conformance(bundle_dir: Path, samples: int = 100, seed: int = 0) -> ConformanceReport:
+def conformance(
+    bundle_dir: Path, samples: int = 100, seed: int = 0, *, holds: bool = False
+) -> ConformanceReport:
     """Load a bundle in every loader, and compare joints, mass and tool pose; see docs/checks.md.
 
     Mimic joints are set like any other joint, except in yourdfpy, which moves them itself. A robot
-    without a frame ``tool`` is compared at its last link.
+    without a frame ``tool`` is compared at its last link. With ``holds`` it also holds its home.
     """
     robot = read_bundle(bundle_dir)
     with loader_copy(bundle_dir) as folder:
-        return compare(robot, folder, samples, seed)
+        report = compare(robot, folder, samples, seed)
+        rows = hold_files(robot, folder) if holds else ()
+    passed = report.passed and all(row.passed is not False for row in rows)
+    return replace(report, passed=passed, holds=rows)
 
 
 def compare(robot: Robot, folder: Path, samples: int = 100, seed: int = 0) -> ConformanceReport:

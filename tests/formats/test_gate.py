@@ -415,7 +415,6 @@ HUGE = {
     "meshes": (20_000, "asset", '<mesh name="m#" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>'),
     "materials": (20_000, "asset", '<material name="m#"/>'),
     "keyframes": (20_000, "keyframe", "<key/>"),
-    "replicates": (20_000, "worldbody", '<replicate count="1"/>'),
     "copies": (1, "worldbody", '<replicate count="9999"><geom size="1"/></replicate>'),
     "cameras": (19_000, "worldbody", "<camera/>"),
     "sites": (19_000, "worldbody", "<site/>"),

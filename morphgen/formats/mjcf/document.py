@@ -23,8 +23,7 @@ from morphgen.model.mesh import require_bounded_files
 MAX_MJCF_BYTES = 8 * 2**20  # largest MJCF that is read, with all its includes [bytes]
 MAX_INCLUDES = 100  # largest number of files that an MJCF includes
 MAX_DEPTH = 40  # deepest nesting of includes
-MAX_COPIES = 10_000  # largest number of elements that the <replicate> elements of an MJCF make
-MAX_ELEMENTS = {"*": 20_000, "body": MAX_LINKS, "default": 1000, "mesh": 2000, "replicate": 100}
+MAX_ELEMENTS = {"*": 20_000, "body": MAX_LINKS, "default": 1000, "mesh": 2000}
 """Largest number of elements of an MJCF with its includes, of all tags and of some. MuJoCo's time
 grows with the square of it."""
 GEOM_TYPES = "box, sphere, cylinder, capsule, ellipsoid or mesh"
@@ -223,24 +222,6 @@ def _require_few_elements(root: etree._Element, path: Path) -> None:
         if count > bound:
             what = "elements" if tag == "*" else f"<{tag}> elements"
             raise FormatError(f"{path}: has {count} {what}; at most {bound} are read")
-    copies = sum(_copies(element, path) for element in root.iter("replicate"))
-    if copies > MAX_COPIES:
-        raise FormatError(
-            f"{path}: <replicate> makes {copies} elements; at most {MAX_COPIES} are read"
-        )
-
-
-def _copies(replicate: etree._Element, path: Path) -> int:
-    """Return how many elements a ``<replicate>`` makes, with those around it."""
-    copies = sum(1 for _ in replicate.iterdescendants())
-    for element in (replicate, *replicate.iterancestors("replicate")):
-        text = element.get("count", "")
-        if not text.strip().isdecimal():
-            raise FormatError(
-                f"{path}: <replicate> has count {text!r}; expected a whole number of at least 1"
-            )
-        copies *= int(text[:12])  # int() refuses texts of more than 4,300 digits
-    return copies
 
 
 def _take_mesh_files(root: etree._Element, path: Path, finder: PackageFinder) -> dict[str, Path]:
