@@ -10,7 +10,7 @@ from pathlib import Path
 
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar
-from morphgen.grammar.analysis import check_grammar, count_structures, load_sound_grammar, variables
+from morphgen.grammar.analysis import check_grammar, count_structures, load_sound_grammar
 from morphgen.grammar.grammar_file import (
     Grammar,
     find_grammar,
@@ -38,28 +38,14 @@ def check(args: argparse.Namespace) -> int:
 
 
 def count(args: argparse.Namespace) -> None:
-    """Print the number of structures and the sampled values."""
+    """Print the number of structures."""
     grammar = load_sound_grammar(args.grammar, opt.library_of(args))
-    structures, sampled = count_structures(grammar), variables(grammar)
-    data = {
-        "structures": int(structures) if structures <= MAX_COUNT else None,
-        "finite": structures != math.inf,
-        "variables": [
-            {"where": v.location, "draw": v.text, "continuous": v.distribution.is_continuous}
-            for v in sampled
-        ],
-    }
-
-    def text() -> str:
-        number = f"{structures}" if structures <= MAX_COUNT else f"more than 10^{COUNT_DIGITS}"
-        number = "infinitely many" if structures == math.inf else number
-        lines = [f"{grammar.name}: {number} structures, {len(sampled)} values drawn"]
-        for variable in sampled:
-            kind = "continuous" if variable.distribution.is_continuous else "discrete"
-            lines.append(f"  {kind:10}  {variable.location} = {variable.text}")
-        return "\n".join(lines)
-
-    opt.print_result(args, data, text)
+    structures = count_structures(grammar)
+    is_exact, is_finite = structures <= MAX_COUNT, structures != math.inf
+    number = f"{structures}" if is_exact else f"more than 10^{COUNT_DIGITS}"
+    text = f"{grammar.name}: {number if is_finite else 'infinitely many'} structures"
+    data = {"structures": int(structures) if is_exact else None, "finite": is_finite}
+    opt.print_result(args, data, lambda: text)
 
 
 def print_grammar(args: argparse.Namespace) -> None:

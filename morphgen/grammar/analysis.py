@@ -1,10 +1,9 @@
-"""Check a grammar for faults, and list the values that it draws."""
+"""Check a grammar for faults, and count its structures."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 from itertools import islice
 
@@ -140,15 +139,6 @@ _TESTED: tuple[values.Draw, ...] = (
 """Selections of the values that ``check_grammar`` tests."""
 
 
-@dataclass(frozen=True)
-class Variable:
-    """A value that a grammar draws."""
-
-    location: str  # `let NAME`, or the symbol, part and parameter, such as `ee: plane.size`
-    distribution: values.Distribution
-    text: str  # the distribution as written in the grammar
-
-
 def check_grammar(grammar: Grammar, library: Library) -> list[str]:
     """Return the faults of a grammar, one line each; an empty list if it is valid.
 
@@ -167,24 +157,6 @@ def load_sound_grammar(name: str, library: Library) -> Grammar:
     if faults := check_grammar(grammar, library):
         raise GrammarError(faults[0] + (f" (and {len(faults) - 1} more)" if faults[1:] else ""))
     return grammar
-
-
-def variables(grammar: Grammar) -> list[Variable]:
-    """Return every value that the grammar draws."""
-    scope = _typical_scope(grammar)
-    expressions = [(f"let {let.name}", let.expression) for let in grammar.lets]
-    expressions += [
-        (f"{production.symbol}: {item.name}.{name}", expression)
-        for production in grammar.productions
-        for item in production.items()
-        for name, expression in item.arguments
-    ]
-    return [
-        Variable(location, values.distribution_of(call, scope)[0], str(call))
-        for location, expression in expressions
-        for call in expression.walk()
-        if call.operator == "call"
-    ]
 
 
 def _item_faults(grammar: Grammar, library: Library) -> Iterator[str]:

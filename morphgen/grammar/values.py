@@ -31,11 +31,6 @@ class Distribution:
         return (min(self.arguments), max(self.arguments))
 
     @property
-    def is_continuous(self) -> bool:
-        """Whether the possible values form an interval."""
-        return self.kind in ("uniform", "loguniform", "normal")
-
-    @property
     def typical(self) -> float:
         """Value used without random draws: the median, the first choice or the least integer."""
         low, high = self.bounds

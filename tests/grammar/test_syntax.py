@@ -18,7 +18,6 @@ from morphgen.errors import GrammarError
 from morphgen.grammar.analysis import (
     check_grammar,
     count_structures,
-    variables,
 )
 from morphgen.grammar.compose import join
 from morphgen.grammar.derive import Chooser, RandomChooser, derive
@@ -613,20 +612,3 @@ def test_a_recursive_grammar_has_infinitely_many_structures():
 def test_shipped_grammars_have_the_documented_number_of_structures():
     expected = {"chain": 6, "nlink": 4, "planar_arm": 8, "prims": 4, "arm3": 1}
     assert {name: count_structures(shipped(name)) for name in expected} == expected
-
-
-def test_every_random_choice_is_listed_with_its_distribution():
-    random_choices = variables(
-        grammar(
-            "let r = uniform(1cm, 2cm)",
-            "let n = 3",
-            "robot -> slides(radius=r) link{2,3}",
-            "link -> bead(radius=r, rod=choice(2cm, r) + uniform(0, 5*r))",
-        )
-    )
-    assert [(v.location, v.text, v.distribution.is_continuous) for v in random_choices] == [
-        ("let r", "uniform(1cm, 2cm)", True),
-        ("link: bead.rod", "choice(2cm, r)", False),
-        ("link: bead.rod", "uniform(0, (5 * r))", True),
-    ]
-    assert random_choices[2].distribution.bounds == pytest.approx((0, 0.075))
