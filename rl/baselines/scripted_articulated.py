@@ -93,8 +93,7 @@ class MotionPlanner:
     ) -> None:
         """Collect free configurations with the tool near the object's contact point."""
         starts, self._robot = spec.goals, spec.robot
-        if not isinstance(starts, ArticulatedStartSet):
-            raise ValueError(f"{self._robot.name} has no articulated object")
+        assert isinstance(starts, ArticulatedStartSet)
         thing = starts.thing
         self._thing, self._edge = thing, starts.edge
         ends = np.concatenate([starts.start, starts.goal])

@@ -177,8 +177,7 @@ class PushPlanner:
     ) -> None:
         """Collect free configurations with a low tool in the region of the push."""
         starts, self._robot = spec.goals, spec.robot
-        if not isinstance(starts, PushStartSet):
-            raise ValueError(f"{self._robot.name} does not push")
+        assert isinstance(starts, PushStartSet)
         self._tool = ToolKinematics(tables, robot)
         self._edge, self._line, self._ground = starts.block.size[0], starts.line, starts.ground
         self._friction = starts.block.friction * starts.block.mass * GRAVITY

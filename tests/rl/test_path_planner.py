@@ -192,18 +192,6 @@ def test_robots_pass_waypoints_that_the_smallest_bin_cannot_reach(made, kind):
     assert ((batch.targets[0] - torch.from_numpy(goal)).abs() <= step / 16 + 1e-6).all()
 
 
-def test_followers_take_paths_of_any_length(made):
-    batch = made("prims", 2)
-    follower = PathFollower(batch)
-    starts = batch.targets.numpy().astype(np.float64)
-    other = starts[1] + 0.1
-    follower.follow(1, [starts[1], other])
-    follower.follow(0, [starts[0]] * 27)
-    finished = torch.stack([follower.advance() for _ in range(27)])
-    assert finished[:, 0].tolist() == [False] * 26 + [True]
-    assert follower.waypoint[1].numpy() == pytest.approx(other, abs=1e-6)
-
-
 @pytest.mark.parametrize("resolution", [RESOLUTION, RESOLUTION / 5])
 @pytest.mark.parametrize("far", [0.0, 0.0501, 0.0999, 0.52])
 def test_tested_configurations_are_no_farther_apart_than_the_resolution(
@@ -348,32 +336,6 @@ def test_a_plan_has_a_free_path_behind_the_block(tmp_path):
     assert np.array_equal(plans[2].path, planner.plan([Push(q, block)])[0].path)
 
 
-def test_a_plan_avoids_overhang(tmp_path, monkeypatch):
-    """A patched overhang penalises configurations near the end of the first plan."""
-    setting = draw_spec(robot(PLANE), PUSH, obstacles=False, seed=0, cache=tmp_path)
-    planner = push_planner_of(setting)
-    q, block = setting.goals.q[0], setting.goals.blocks[0]
-    first = planner.plan([Push(q, block)])[0].path[-1]
-
-    def near(configurations):
-        return np.abs(configurations - first).max(axis=-1) < 1.0
-
-    def said(space, configurations, blocks, edge):
-        assert blocks.shape == (len(configurations), 7)
-        assert (blocks[:, 1] >= block[1]).all()
-        return pushing.MAX_OVERHANG * near(configurations)
-
-    monkeypatch.setattr(pushing, "overhang", said)
-    assert near(first)
-    assert not near(planner.plan([Push(q, block)])[0].path[-1])
-
-
-def test_the_planner_rejects_other_tasks(tmp_path):
-    setting = draw_spec(robot(PLANE), FEW_REACH, obstacles=False, seed=0, cache=tmp_path)
-    with pytest.raises(ValueError, match="does not push"):
-        push_planner_of(setting)
-
-
 @pytest.mark.slow
 def test_obstructed_arms_push_below_the_middle(tmp_path):
     """Starts of YuMi without a straight path behind the block."""
@@ -387,16 +349,6 @@ def test_obstructed_arms_push_below_the_middle(tmp_path):
         contacts = pushing.find_contacts(space, end[None], block[None], edge)
         centred = block[None] + contacts.offset[0] * X
         assert pushing.overhang(space, end[None], centred, edge)[0] < 0.05
-
-
-def test_the_tool_can_turn_around():
-    tables = build_robot_tables([robot(PANDA)])
-    tool, q = ToolKinematics(tables, 0), np.array([tables.robots[0].home])
-    position, rotation = tool.poses(q)
-    turned = rotation @ np.diag([-1.0, -1.0, 1.0])
-    reached = tool.poses(tool.move_towards(q, position, turned, 60))
-    assert np.abs(reached[0] - position).max() < 5e-3
-    assert np.abs(reached[1] - turned).max() < 0.02
 
 
 def space_at_block(pusher):

@@ -209,21 +209,6 @@ def test_the_seed_determines_the_weights_and_torchs_generator_is_unchanged():
     assert not pairs[0]["network.index"].equal(pairs[2]["network.index"])
 
 
-@agents
-def test_bfloat16_outputs_are_close_and_masked(agent):
-    seen = observed()
-    actor, critic = networks(agent, seen)
-    with torch.autocast("cpu", torch.bfloat16):
-        numbers, value = actor(seen), critic(seen)
-        dirty = filled(seen, math.nan)
-        assert numbers.equal(actor(dirty))
-        assert value.equal(critic(dirty))
-    assert numbers.dtype == value.dtype == torch.float32
-    exact = actor(seen)
-    assert (numbers - exact).abs().max() < 0.05 * exact.abs().max()
-    assert 0 < (value - critic(seen)).abs().max() < 0.05 * critic(seen).abs().max()
-
-
 def test_weights_for_other_observations_are_rejected_with_the_difference():
     here = layout_of(observed())
     fewer = {**observed(extras=False), "obstacles": torch.zeros(N, 0, 13)}

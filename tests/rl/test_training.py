@@ -176,15 +176,6 @@ def test_checkpoints_are_five_to_ten_episodes_apart_and_four_at_least(updates, s
     assert training.updates_between(config) == expected
 
 
-def test_no_checkpoint_is_written_right_before_the_last(tmp_path, monkeypatch):
-    made = []
-    monkeypatch.setattr(
-        training, "write_checkpoint", lambda folder, config, state: made.append(state["update"])
-    )
-    train(tmp_path, small_config(total_timesteps=9 * 4 * 8), execution=QUIET)
-    assert made == [2, 4, 6, 9]
-
-
 def test_weights_depend_on_the_seed_and_not_on_the_workers(tmp_path):
     ways = {"a": (0, QUIET), "b": (0, ExecutionConfig(2, tensorboard=False)), "c": (1, QUIET)}
     for name, (seed, execution) in ways.items():
@@ -405,15 +396,6 @@ def test_actuated_joints_are_counted_as_batches_do(task):
     assert [training.num_actuated(robot, task) for robot in robots] == mask.sum(dim=1).tolist()
 
 
-def test_a_run_with_an_environment_for_every_robot_has_one_batch(tmp_path):
-    config = drawn_config("cubes:2,stick:1", updates=6, slice_updates=0)
-    run(tmp_path / "run", config)
-    files = [CHECKPOINT, "config.json", "metrics.jsonl", sources.FILE]
-    assert sorted(tree(tmp_path / "run")) == files
-    assert read_config(tmp_path / "run") == config
-    assert not TrainingBatches(config).changes_at(3)
-
-
 def test_runs_that_would_leave_robots_out_are_refused(tmp_path):
     own = split((member("base=planar ee=cube"),), (member("base=gantry ee=plane"),))
     write_split(own, tmp_path / "own.yaml")
@@ -438,19 +420,6 @@ def test_a_run_of_other_robots_is_not_resumed(tmp_path):
     for other in (drawn_config(updates=8, seed=1), drawn_config("cubes:5,stick:2", updates=8)):
         with pytest.raises(TaskError, match="has another run: source"):
             run(tmp_path / "run", other)
-
-
-def test_a_learner_continues_in_another_batch():
-    agent = learner()
-    agent.iterate()
-    other = OnALine(8, seed=1)
-    training.use_batch(agent, other)
-    assert agent.batch is other
-    before = other.state_dict()
-    assert before == OnALine(8, seed=1).state_dict()  # nothing was drawn yet
-    agent.iterate()
-    assert other.spread
-    assert other.progress == [1 / 4]
 
 
 def test_a_batch_that_does_not_fit_is_refused():
