@@ -34,11 +34,11 @@ from morphgen.tasks.gym.vector import (
     observation_space,
 )
 from morphgen.tasks.observation import LinkJoints, LinkTokens, Observation
-from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS
+from morphgen.tasks.registry import TASKS
 from morphgen.tasks.renderer import SIZE, Frame, Renderer, render_state
 from morphgen.tasks.rows import numpy_row
 from morphgen.tasks.scenes.make import make_batch
-from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts
+from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.tasks.task import STANDARD_FIELDS, StepFormulas, StepResult, TaskConfig
 
 EnvStep = tuple[NumpyObservation, float, bool, bool, dict[str, Any]]
@@ -178,9 +178,8 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
     ``morphgen.tasks.actions.BINS``.
 
     ``info`` has ``success``, which is also ``is_success``, ``distance``, ``score``, ``diverged``,
-    ``terms``, for goals that are poses ``angle`` (see ``Step``), and ``self_collision``: whether
-    links collide with each other in this environment. Episodes end by themselves, after
-    ``spec.max_episode_steps`` at the latest: no time limit wrapper is needed.
+    ``terms`` and, for goals that are poses, ``angle`` (see ``Step``). Episodes end by themselves,
+    after ``spec.max_episode_steps`` at the latest: no time limit wrapper is needed.
 
     ``reset(seed=s)`` begins the same episodes as environment 0 of ``make_batch(..., seed=s)``.
 
@@ -216,9 +215,6 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         self._size, self.render_mode = render_arguments(render_mode, size), render_mode
         self._renderer: Renderer | None = None
         options = batch_options("one environment", task, config, options, _OPTIONS)
-        sim = SIMULATORS[options.get("sim") or DEFAULT_SIMULATOR]
-        contacts: Contacts = options["contacts"] or Contacts()
-        self._self_collision = contacts.self_collision and sim.simulates_contacts
         episode_limit(_limit_for_make(), task, options)
         self.task = task
         batch = make_batch(task, [robot], 1, **options)
@@ -253,7 +249,7 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         observation = self._without_padding(self.batch.reset(seed))
         self._stepper.begin(observation)
         self._running = self._was_reset = True
-        return observation, {"self_collision": self._self_collision}
+        return observation, {}
 
     def step(self, action: NDArray[Any]) -> EnvStep:
         """Act for one control step."""
@@ -264,7 +260,6 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
             raise TaskError(f"the action has shape {action.shape}; expected {expected}: {joints}")
         observation, reward, terminated, truncated, info = self._stepper.step(action)
         self._running = not (terminated or truncated)
-        info["self_collision"] = self._self_collision
         return observation, reward, terminated, truncated, info
 
     def render(self) -> Frame | None:

@@ -359,8 +359,7 @@ CONTROL_STEP = np.linalg.matrix_power(
 at the beginning, shape (2, 2).
 
 A physics step is v' = v + dt (omega^2 e - 2 omega v), q' = q + dt v', as in MuJoCo. Tools that
-follow the exact solution of the differential equation are several times as far from MuJoCo's, which
-``tests/tasks/test_kinematic_sim.py`` checks.
+follow the exact solution of the differential equation are several times as far from MuJoCo's.
 """
 
 

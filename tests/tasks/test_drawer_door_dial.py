@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -481,21 +480,6 @@ def test_points_lie_on_the_box_at_the_contact_point(task, make):
     away = (np.abs(local) - size / 2).max(axis=1)
     assert np.abs(away).max() < 5 * NOISE
     assert np.abs(away).mean() < NOISE
-
-
-@each_object
-def test_gymnasium_makes_the_environment(task, cache):
-    name = f"morphgen.tasks.gym.env:morphgen/{task.capitalize()}-v0"
-    made = gym.make(name, robot=ROBOT, config=CONFIGS[task], cache=cache)
-    seen, _ = made.reset(seed=0)
-    assert seen.keys() >= {"tokens", "object", "object_base", "object_joint"}
-    assert not seen.keys() & {"goal", "line", "joint_mask"}
-    seen, reward, terminated, truncated, info = made.step(made.action_space.sample())
-    assert made.observation_space.contains(seen)
-    assert np.isfinite(reward)
-    assert (terminated, truncated, info["success"]) == (False, False, False)
-    assert 0 < info["distance"] < 0.5
-    made.close()
 
 
 LEVER = """\

@@ -375,20 +375,11 @@ def test_last_observation_of_an_episode_is_returned(made):
     assert [step[2:4] for step in steps] == [(False, k == STEPS - 1) for k in range(STEPS)]
     seen, *_, info = steps[-1]
     assert np.abs(seen["velocity"]).max() > 0
-    names = {"success", "is_success", "distance", "score", "diverged", "terms", "self_collision"}
+    names = {"success", "is_success", "distance", "score", "diverged", "terms"}
     assert set(info) == names
     assert info["terms"]["distance"] == pytest.approx(-info["distance"])
     with pytest.raises(TaskError, match="no episode is running; call reset"):
         env.step(np.ones(5, dtype=np.float32))
-
-
-@pytest.mark.parametrize(
-    "options", [{"contacts": Contacts(self_collision=False)}, {"sim": "kinematic"}]
-)
-def test_info_describes_the_contact_settings(made, options):
-    env = made(**options)
-    assert env.reset(seed=0)[1] == {"self_collision": False}
-    assert env.step(env.action_space.sample())[4]["self_collision"] is False
 
 
 @pytest.mark.parametrize(("name", "robot"), [(REACH, "arm3-stick"), (PUSH, "prims")])

@@ -9,7 +9,7 @@ import torch
 
 from helpers.faulty_robots import with_joint
 from helpers.goal_sets import draw_spec
-from helpers.robots import arm, finger
+from helpers.robots import arm
 from helpers.scenes import (
     PAPER_ROBOTS,
     SECOND,
@@ -22,7 +22,6 @@ from helpers.scenes import (
     smooth_walk,
 )
 from morphgen.errors import SimulationError, TaskError
-from morphgen.model.dynamics import BANDWIDTH
 from morphgen.model.kinematics import forward_kinematics, frame_pose, joint_limits
 from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.registry import (
@@ -32,7 +31,7 @@ from morphgen.tasks.registry import (
     installed_simulators,
 )
 from morphgen.tasks.scenes.make import batch_from_specs, make_batch
-from morphgen.tasks.sim.base import CONTROL_PERIOD, LAG, Contacts, Scene, speed_limit
+from morphgen.tasks.sim.base import CONTROL_PERIOD, Contacts, Scene, speed_limit
 from morphgen.tasks.sim.kinematic import NO_CONTACTS, KinematicSimulation
 from morphgen.tasks.sim.mujoco_sim import MujocoSimulation
 
@@ -56,18 +55,6 @@ def follow(sim, targets):
 
 def in_free_space(simulation, body, targets):
     return follow(simulation([Scene(body, ground=None)], NO_CONTACTS), targets)
-
-
-def exact_law(body, targets):
-    """Return positions by the exact solution of the critically damped differential equation."""
-    q, qd, path = np.array(body.home), np.zeros(body.dof), []
-    decay, lag = np.exp(-BANDWIDTH * CONTROL_PERIOD), BANDWIDTH * CONTROL_PERIOD
-    for target in targets:
-        error = target - q
-        q = target - decay * ((1 + lag) * error - CONTROL_PERIOD * qd)
-        qd = decay * (BANDWIDTH * lag * error + (1 - lag) * qd)
-        path.append(q)
-    return np.array(path)
 
 
 def largest_tool_distance(body, a, b):
@@ -108,28 +95,6 @@ def test_distant_targets_are_approached_as_fast_as_in_mujoco(words):
     speeds = np.abs(np.diff(ours, axis=0)).max(axis=0) / CONTROL_PERIOD
     assert (speeds < 4 / 3 * limits).all()
     assert (speeds > limits).any()
-
-
-def test_substeps_of_the_law_match_mujoco_better_than_its_exact_solution():
-    for words in (REVOLUTE, PRISMATIC, MIXED):
-        body = robot(words)
-        targets = smooth_walk(body, seed=0)
-        mujoco = in_free_space(MujocoSimulation, body, targets)
-        ours = in_free_space(KinematicSimulation, body, targets)
-        exact = exact_law(body, targets)
-        distance = largest_tool_distance(body, ours, mujoco)
-        assert distance < largest_tool_distance(body, exact, mujoco) / 2
-
-
-def test_steady_motion_lags_by_the_law():
-    body = finger(2.0)
-    speed = 0.5 * np.array([speed_limit(body.joints[k]) for k in body.independent_joints])
-    targets = np.array(body.home) + np.outer(np.arange(1, 41), speed * CONTROL_PERIOD)
-    path = follow(KinematicSimulation([Scene(body)]), targets)
-    lag = (targets[-1] - path[-1]) / speed
-    assert (lag > 0).all()
-    assert (lag + CONTROL_PERIOD < LAG * 1.01).all()
-    np.testing.assert_allclose((path[-1] - path[-2]) / CONTROL_PERIOD, speed, rtol=1e-4)
 
 
 @pytest.mark.parametrize("words", ROBOTS)
