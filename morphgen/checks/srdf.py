@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -17,7 +16,7 @@ from morphgen.checks.self_collision import ALWAYS_SHARE, SelfCollisionChecker, a
 from morphgen.errors import FormatError, nearest, shortened
 from morphgen.formats.data_files import read_bytes
 from morphgen.formats.xml import parse_xml, read_schema
-from morphgen.model.geometry import Mesh, Sphere
+from morphgen.model.geometry import Sphere
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import TOOL, Frame, Pair, Robot, sorted_pair
 from morphgen.model.tree import below
@@ -75,7 +74,7 @@ def _with_loose_joints(robot: Robot) -> tuple[Robot, list[int]]:
 
 
 def robot_srdf_text(robot: Robot, *, samples: int = MATRIX_SAMPLES, seed: int = 0) -> str:
-    """Return the SRDF of a robot as text, with the evidence of its disabled pairs as a comment.
+    """Return the SRDF of a robot as text.
 
     Every tool has a group ``arm``, the chain from the root, and ``ee`` if it has an end-effector:
     the links of its part, or those around the joints that do not move the tool. The groups of a
@@ -97,8 +96,6 @@ def robot_srdf_text(robot: Robot, *, samples: int = MATRIX_SAMPLES, seed: int = 
             for center, radius in balls:
                 values = {"center": _numbers(*center), "radius": _numbers(radius)}
                 etree.SubElement(element, "sphere", values)
-    evidence = _evidence(robot, reasons, f"{samples} configurations sampled with seed {seed}")
-    root.append(etree.Comment(f" {evidence} "))
     for (a, b), reason in reasons.items():
         etree.SubElement(root, "disable_collisions", link1=a, link2=b, reason=reason)
     etree.indent(root)
@@ -135,22 +132,6 @@ def _write_limbs(root: etree._Element, robot: Robot, limbs: Sequence[_Limb]) -> 
 def _numbers(*values: float) -> str:
     """Return numbers with all their digits, so that reading them back is exact."""
     return " ".join(repr(float(value)) for value in values)
-
-
-def _evidence(robot: Robot, reasons: Mapping[Pair, Reason], sampled: str) -> str:
-    """Return sentences about how pairs that need no test were found, and how many."""
-    count = Counter(reasons.values())
-    counts = ", ".join(f"{count[reason]} {reason}" for reason in REASONS)
-    shapes = (shape.geometry for link in robot.links for shape in link.collisions)
-    has_mesh = any(isinstance(shape, Mesh) for shape in shapes)
-    about_meshes = " Meshes count as their convex hulls." if has_mesh else ""
-    num_pairs = math.comb(sum(bool(link.collisions) for link in robot.links), 2)
-    return (
-        f"{num_pairs} pairs of links with collision shapes, {sampled}. Disabled: {counts}. "
-        f"Always: in collision in at least {ALWAYS_SHARE:.0%} of the configurations. "
-        "Never: in collision in none of them. User: ignored by the robot for another reason."
-        f"{about_meshes}"
-    )
 
 
 class _Limb(NamedTuple):

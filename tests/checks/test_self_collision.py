@@ -277,16 +277,13 @@ def test_reasons_agree_with_brute_force():
     assert ("slide", "turn") not in reasons  # collides at times
 
 
-def test_srdf_holds_the_matrix_with_its_evidence():
+def test_srdf_holds_the_matrix():
     robot = balls()
     text = robot_srdf_text(robot, samples=50, seed=1)
     reasons = collision_matrix(robot, samples=50, seed=1)
     srdf = parse_srdf(text.encode(), "balls")
     disabled = srdf.findall("disable_collisions")
     assert {(p.get("link1"), p.get("link2")): p.get("reason") for p in disabled} == reasons
-    assert "28 pairs of links with collision shapes, 50 configurations sampled with seed 1" in text
-    defaults = [*reasons.values()].count("Default")
-    assert f"7 Adjacent, {defaults} Default" in text
     assert text == robot_srdf_text(robot, samples=50, seed=1)
     assert set(with_disabled_pairs(robot, srdf).ignore_pairs) == set(reasons)
 
@@ -312,7 +309,7 @@ TEXT = """\
   <link_sphere_approximation link="upper">
     <sphere center="0.1 -0.2 0.14285714285714285" radius="0.05"/>
   </link_sphere_approximation>
-  <!-- """
+  <disable_collisions """
 
 
 def test_gripper_of_an_imported_arm_is_an_end_effector(tmp_path):

@@ -505,7 +505,7 @@ def test_visual_and_collision_geoms_are_told_apart(tmp_path):
     assert b.collisions[0].rgba is None
 
 
-def test_joint_equalities_become_mimic_and_fixed_joints(tmp_path):
+def test_joint_equalities_become_mimic_joints(tmp_path):
     path = write(
         tmp_path,
         """
@@ -513,56 +513,25 @@ def test_joint_equalities_become_mimic_and_fixed_joints(tmp_path):
         <worldbody><body name="base"><geom size="0.1"/>
           <body name="left"><joint name="a" ref="0.2" range="-1 1"/><geom size="0.1"/></body>
           <body name="right"><joint name="b" ref="0.1" range="-3 3"/><geom size="0.1"/></body>
-          <body name="held"><joint name="c" ref="0.3" range="-1 1"/>
-            <geom size="0.1" pos="0.5 0.1 0"/></body>
         </body></worldbody>
-        <equality><joint joint1="b" joint2="a" polycoef="0.5 -2 0 0 0"/>
-          <joint joint1="c" polycoef="0.4 0 0 0 0"/></equality>
+        <equality><joint joint1="b" joint2="a" polycoef="0.5 -2 0 0 0"/></equality>
         <tendon><fixed name="both"><joint joint="a" coef="1"/><joint joint="b" coef="1"/></fixed>
         </tendon>
         <actuator><position tendon="both" kp="1"/>
           <motor joint="a" gear="3" ctrlrange="-2 2"/></actuator>
         <contact><exclude body1="right" body2="left"/></contact>
-        <keyframe><key qpos="0.9 0 0"/><key name="home" qpos="0.5 0 0"/></keyframe>""",
+        <keyframe><key qpos="0.9 0"/><key name="home" qpos="0.5 0"/></keyframe>""",
     )
     robot = read_mjcf(path)
-    _, b, c = robot.joints
+    _, b = robot.joints
     assert (b.mimic.joint, b.mimic.multiplier) == ("a", -2.0)
     assert b.mimic.offset == pytest.approx(0.1 + 0.5 + 2 * 0.2)
-    assert c.kind == "fixed"
     assert robot.home == (0.5,)
     assert robot.ignore_pairs == (("left", "right"),)
     assert robot.joints[0].effort == 6.0
     follower = 0.1 + 0.5 - 2 * (0.5 - 0.2)  # from its reference, as the leader
     data = mujoco_data(path)
-    data.qpos[:] = (0.5, follower, 0.3 + 0.4)
-    assert_pose_agrees(robot, robot.home, data)
-
-
-def test_fixed_tendon_of_two_joints_held_by_an_equality_is_a_mimic(tmp_path):
-    robot = read(
-        tmp_path,
-        TWO_JOINTS
-        + """<tendon><fixed name="t"><joint joint="a" coef="2"/><joint joint="b" coef="4"/></fixed>
-        </tendon><equality><tendon tendon1="t" polycoef="0.4 0 0 0 0"/></equality>""",
-    )
-    mimic = robot.joints[1].mimic
-    assert (mimic.joint, mimic.multiplier, mimic.offset) == ("a", -0.5, pytest.approx(0.1))
-
-
-def test_joint_that_follows_a_held_joint_is_held(tmp_path):
-    path = write(
-        tmp_path,
-        """<compiler angle="radian"/><worldbody><body name="base"><geom size="0.1"/>
-        <body name="x"><joint name="a"/><geom size="0.1" pos="1 0 0"/></body>
-        <body name="y"><joint name="b" axis="1 0 0"/><geom size="0.1" pos="0 1 0"/></body>
-        </body></worldbody><equality><joint joint1="b" joint2="a" polycoef="0.1 2 0 0 0"/>
-        <joint joint1="a" polycoef="0.3 0 0 0 0"/></equality>""",
-    )
-    robot = read_mjcf(path)
-    assert robot.dof == 0
-    data = mujoco_data(path)
-    data.qpos[:] = (0.3, 0.7)
+    data.qpos[:] = (0.5, follower)
     assert_pose_agrees(robot, robot.home, data)
 
 
@@ -679,9 +648,18 @@ BODY = '<body name="{}"><geom size="0.1"/>{}</body>'
             "equality 'a - b': its polycoef has degree 3; expected degree 1, as of a mimic joint",
         ),
         (
-            f'{TWO_JOINTS}<equality><joint joint1="a"/><joint name="e" joint1="a" joint2="b"/>'
-            "</equality>",
+            f'{TWO_JOINTS}<equality><joint joint1="a" joint2="b"/>'
+            '<joint name="e" joint1="a" joint2="b"/></equality>',
             "equality 'e': another one couples joint 'a', too; expected one",
+        ),
+        (
+            f'{TWO_JOINTS}<equality><joint name="e" joint1="a"/></equality>',
+            "equality 'e' holds a joint in place; expected joint2, or no joint",
+        ),
+        (
+            f'{TWO_JOINTS}{COUPLING}<equality><tendon name="e" tendon1="t"/></equality>',
+            "equality 'e': a tendon constraint has no counterpart; expected joint constraints of "
+            "degree 1",
         ),
         (
             WORLD.format('<geom name="table" type="plane" size="1 2 3"/><geom size="1"/>'),
@@ -724,17 +702,13 @@ def test_content_without_a_counterpart_is_refused(content, message, tmp_path):
 
 
 def test_couplings_with_the_rest_of_a_scene_are_refused(tmp_path):
-    couplings = {
-        '<equality><joint joint1="a" joint2="b"/></equality>': "equality 'a - b'",
-        f'{COUPLING}<equality><tendon name="e" tendon1="t"/></equality>': "equality 'e'",
-    }
+    coupling = '<equality><joint joint1="a" joint2="b"/></equality>'
     scene = TWO_JOINTS.replace(
         '<body name="left">', '<body name="arm"><geom size="1"/><body name="left">'
     ).replace('<body name="right">', '</body><body name="right">')
-    for coupling, place in couplings.items():
-        assert refusal(tmp_path, scene + coupling, root_body="arm") == (
-            f"{place}: joint 'b' is not of the robot"
-        )
+    assert refusal(tmp_path, scene + coupling, root_body="arm") == (
+        "equality 'a - b': joint 'b' is not of the robot"
+    )
 
 
 def test_includes_stay_in_the_folder(tmp_path):

@@ -68,7 +68,7 @@ _ARRAYS = (
     *("body_pos", "body_quat", "body_ipos", "body_iquat", "body_mass", "body_inertia"),
     *("jnt_pos", "jnt_axis", "jnt_range", "qpos0", "dof_damping", "dof_frictionloss", "key_qpos"),
     *("geom_pos", "geom_quat", "geom_size", "geom_rgba", "mat_rgba", "site_pos", "site_quat"),
-    *("eq_data", "tendon_length0", "wrap_prm"),
+    "eq_data",
     *("jnt_actfrcrange", "actuator_forcerange", "actuator_ctrlrange", "actuator_gainprm"),
     "actuator_gear",
 )
@@ -435,13 +435,10 @@ class _Reader:
         axis = rotation.vec3(model.jnt_axis[joint])
         # The link of a hinge is at its anchor; a slide moves every point alike.
         anchor = (0.0, 0.0, 0.0) if is_slide else rotation.vec3(model.jnt_pos[joint])
-        position = self._couplings.locks.get(joint, 0.0)
         # The body is written at the joint's ref, and a URDF's at position zero.
-        motion = position - _ref(model, joint)
-        T_parent_joint = T_parent_body @ Pose(anchor) @ _displacement(is_slide, axis, motion)
+        back = _displacement(is_slide, axis, -_ref(model, joint))
+        T_parent_joint = T_parent_body @ Pose(anchor) @ back
         T_child_body = Pose((-anchor[0], -anchor[1], -anchor[2])) if any(anchor) else IDENTITY
-        if joint in self._couplings.locks:
-            return Joint(name, "fixed", parent, child, T_parent_joint, axis), T_child_body
         lower, upper = model.jnt_range[joint].tolist()
         is_limited = bool(model.jnt_limited[joint])
         kind: JointKind = "prismatic" if is_slide else "revolute" if is_limited else "continuous"
@@ -646,7 +643,6 @@ class _Couplings:
 
     Attributes:
         mimics: Leader, multiplier and offset [rad or m] of each coupled joint.
-        locks: Position of each joint that is held in place [rad or m].
     """
 
     def __init__(
@@ -658,18 +654,13 @@ class _Couplings:
         findings: list[Finding],
     ) -> None:
         self.mimics: dict[int, tuple[int, float, float]] = {}
-        self.locks: dict[int, float] = {}
         self._model, self._document, self._findings = model, document, findings
         self._joints, self._bodies = set(joints), set(bodies)
-        resolved_tendons = set()
         for k in range(model.neq):
             if model.eq_active0[k] and any(map(self._is_on_robot, self._ends(k))):
                 self._add(k)
-                if model.eq_type[k] == _EQ.mjEQ_TENDON:
-                    resolved_tendons.add(int(model.eq_obj1id[k]))
-        self._lock_followers()
         for tendon in range(model.ntendon):
-            if tendon not in resolved_tendons and self._is_on_robot((_OBJ.mjOBJ_TENDON, tendon)):
+            if self._is_on_robot((_OBJ.mjOBJ_TENDON, tendon)):
                 self._require_actuation_only(tendon)
 
     def _ends(self, equality: int) -> list[tuple[int, int]]:
@@ -699,15 +690,13 @@ class _Couplings:
         return not self._bodies.isdisjoint(self._bodies_of(*item))
 
     def _add(self, k: int) -> None:
-        """Add a constraint to the mimics or locks, or a finding about it."""
+        """Add a constraint to the mimics, or a finding about it."""
         model, ends = self._model, self._ends(k)
         kind = _EQ(model.eq_type[k])
         names = (mujoco.mj_id2name(model, int(object_type), end) or "" for object_type, end in ends)
         name = model.equality(k).name or " - ".join(names)
         if kind == _EQ.mjEQ_JOINT:
             self._add_joint_equality(k, name)
-        elif kind == _EQ.mjEQ_TENDON and self._add_tendon_equality(k, name):
-            return
         elif kind in (_EQ.mjEQ_CONNECT, _EQ.mjEQ_WELD) and any(
             body not in self._bodies and model.body_mocapid[body] >= 0
             for end in ends
@@ -723,14 +712,14 @@ class _Couplings:
             )
 
     def _add_joint_equality(self, k: int, name: str) -> None:
-        """Add q1 - ref1 = a0 + a1 (q2 - ref2), or a1 = 0 without a second joint."""
+        """Add q1 - ref1 = a0 + a1 (q2 - ref2)."""
         model = self._model
         follower, leader = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
         a0, a1, *higher = (float(value) for value in model.eq_data[k, :5])
         if leader < 0:
-            self._claim(follower, name)
-            self.locks[follower] = _ref(model, follower) + a0
-            return
+            raise self._document.error(
+                f"equality {name!r} holds a joint in place; expected joint2, or no joint"
+            )
         if any(higher):
             degree = max(power for power, value in enumerate(higher, start=2) if value)
             raise self._document.error(
@@ -741,41 +730,18 @@ class _Couplings:
         offset = _ref(model, follower) + a0 - a1 * _ref(model, leader)
         self.mimics[follower] = (leader, a1, offset)
 
-    def _add_tendon_equality(self, k: int, name: str) -> bool:
-        """Add c1 q1 + c2 q2 = length0 + a0 of a fixed tendon; False if it is something else."""
-        model = self._model
-        terms = self._terms(int(model.eq_obj1id[k]))
-        if model.eq_obj2id[k] >= 0 or terms is None or len({joint for joint, _ in terms}) != 2:
-            return False
-        (leader, c_leader), (follower, c_follower), *others = terms
-        if others or c_follower == 0:
-            return False
-        self._claim(follower, name, leader)
-        length = float(model.tendon_length0[model.eq_obj1id[k]]) + float(model.eq_data[k, 0])
-        self.mimics[follower] = (leader, -c_leader / c_follower, length / c_follower)
-        return True
-
-    def _claim(self, joint: int, name: str, leader: int | None = None) -> None:
+    def _claim(self, joint: int, name: str, leader: int) -> None:
         """Require that the joints are of the robot, and that no other constraint determines one."""
-        if leader is not None:
-            ends = (joint, leader)
-            outside = [_joint_label(self._model, j) for j in ends if j not in self._joints]
-            if outside:
-                raise self._document.error(
-                    f"equality {name!r}: joint {listed(outside)} is not of the robot"
-                )
-        if joint in self.mimics or joint in self.locks:
+        ends = (joint, leader)
+        if outside := [_joint_label(self._model, j) for j in ends if j not in self._joints]:
+            raise self._document.error(
+                f"equality {name!r}: joint {listed(outside)} is not of the robot"
+            )
+        if joint in self.mimics:
             raise self._document.error(
                 f"equality {name!r}: another one couples joint "
                 f"{self._model.joint(joint).name!r}, too; expected one"
             )
-
-    def _lock_followers(self) -> None:
-        """Hold the joints that follow a joint that is held."""
-        while held := [j for j, (leader, _, _) in self.mimics.items() if leader in self.locks]:
-            for joint in held:
-                leader, multiplier, offset = self.mimics.pop(joint)
-                self.locks[joint] = multiplier * self.locks[leader] + offset
 
     def _leader(self, joint: int) -> int:
         """Return the joint at the end of a chain of mimics, or the joint that closes a circle."""
@@ -789,30 +755,22 @@ class _Couplings:
 
     def _require_actuation_only(self, tendon: int) -> None:
         model = self._model
-        name, terms = model.tendon(tendon).name, self._terms(tendon)
-        if terms is None:
+        name, wraps = model.tendon(tendon).name, self._wraps(tendon)
+        if any(model.wrap_type[w] != _WRAP.mjWRAP_JOINT for w in wraps):
             raise self._document.error(
                 f"tendon {name!r} is spatial, which has no counterpart; remove it and what uses it"
             )
-        moving = [joint for joint, _ in terms if joint not in self.locks]
-        if len({self._leader(joint) for joint in moving}) > 1:
+        joints = [int(model.wrap_objid[w]) for w in wraps]
+        if len({self._leader(joint) for joint in joints}) > 1:
             raise self._document.error(
                 f"tendon {name!r} couples the joints "
-                f"{listed(model.joint(joint).name for joint in moving)}, which has no counterpart; "
+                f"{listed(model.joint(joint).name for joint in joints)}, which has no counterpart; "
                 "couple them by <equality><joint>, or remove the tendon and what uses it"
             )
 
     def _wraps(self, tendon: int) -> range:
         first = int(self._model.tendon_adr[tendon])
         return range(first, first + int(self._model.tendon_num[tendon]))
-
-    def _terms(self, tendon: int) -> list[tuple[int, float]] | None:
-        """Return joint and coefficient of every term of a fixed tendon; None for a spatial one."""
-        model = self._model
-        wraps = self._wraps(tendon)
-        if any(model.wrap_type[w] != _WRAP.mjWRAP_JOINT for w in wraps):
-            return None
-        return [(int(model.wrap_objid[w]), float(model.wrap_prm[w])) for w in wraps]
 
 
 def _ref(model: mujoco.MjModel, joint: int) -> float:
