@@ -38,11 +38,7 @@ MAX_REFUSAL = 2000  # characters that are read of why a robot has no goals
 
 @cache
 def packaged_index() -> Mapping[str, Mapping[str, Any]]:
-    """Return a record of each packaged set by the set's key.
-
-    A record has ``file`` with its ``sha256`` and ``bytes``, ``task``, ``obstacles``, and
-    ``robot``, the hash of the robot in splits.
-    """
+    """Return a record of each packaged set, such as its file and hash, by the set's key."""
     records: dict[str, dict[str, Any]] = json.loads((FOLDER / INDEX).read_text(encoding="utf-8"))
     return records
 

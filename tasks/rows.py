@@ -18,7 +18,6 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.errors import TaskError
-from morphgen.model.kinematics_torch import angle_between
 from morphgen.tasks.task import A, GoalSet
 
 T = TypeVar("T")
@@ -81,11 +80,16 @@ def rotated(quaternions: A, vectors: A) -> A:
 
 
 def angles_between(rotations: A, others: A) -> A:
-    """Return the angles between rotation matrices (n, 3, 3), shape (n,) [rad]."""
+    """Return the angles between rotation matrices (n, 3, 3), shape (n,) [rad].
+
+    The Frobenius norm of their difference is sqrt(8) sin(angle / 2), which is well-conditioned at 0
+    in double precision: squares of small differences vanish in single precision.
+    """
     if isinstance(rotations, torch.Tensor):
-        return angle_between(rotations, others)
-    apart = math.hypot(*(rotations - others).ravel().tolist())
-    angle: A = _number(2 * math.asin(min(apart / math.sqrt(8), 1.0)))
+        norm = (rotations - others).double().square().sum(dim=(1, 2)).sqrt().float()
+        return 2 * torch.asin((norm / 8**0.5).clamp(max=1))
+    sine = math.hypot(*(rotations - others).ravel().tolist()) / 8**0.5
+    angle: A = _number(2 * math.asin(min(sine, 1.0)))
     return angle
 
 

@@ -81,16 +81,6 @@ def rotation_from_z(axes: torch.Tensor) -> torch.Tensor:
     return torch.where(opposite[..., None, None], half_turn, R)
 
 
-def angle_between(A: torch.Tensor, B: torch.Tensor) -> torch.Tensor:
-    """Return the angles between rotation matrices (n, 3, 3), shape (n,) [rad].
-
-    The Frobenius norm of A - B is sqrt(8) sin(angle / 2), which is well-conditioned at 0.
-    """
-    # Squares of small differences vanish in single precision.
-    norm = (A - B).double().square().sum(dim=(1, 2)).sqrt().float()
-    return 2 * torch.asin((norm / 8**0.5).clamp(max=1))
-
-
 def rotvec_from_matrix(R: torch.Tensor) -> torch.Tensor:
     """Return rotation vectors, angle times axis, (n, 3) [rad] of rotation matrices (n, 3, 3).
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morphgen.errors import MeshError
-from morphgen.files import content_sha256, keep, read_kept
+from morphgen.files import content_sha256, file_stamp, keep, read_kept
 from morphgen.model.geometry import Mesh, MeshContent, MeshPart, Rgba
 from morphgen.typing import Array
 
@@ -56,7 +56,7 @@ def _until_changed(function: Callable[[Mesh], T]) -> Callable[[Mesh], T]:
 
     @wraps(cached)
     def call(mesh: Mesh) -> T:
-        return cached(replace(mesh, path=mesh.path.absolute()), _stamp(mesh.path))
+        return cached(replace(mesh, path=mesh.path.absolute()), file_stamp(mesh.path))
 
     return call
 
@@ -86,7 +86,7 @@ def mesh_parts(path: Path) -> tuple[MeshPart, ...]:
 
 def require_bounded_files(paths: Iterable[Path], origin: str) -> None:
     """Require that the mesh files of one robot have at most ``MAX_ROBOT_BYTES``."""
-    size = sum(_stamp(path)[1] for path in {*paths})
+    size = sum(file_stamp(path)[1] for path in {*paths})
     _require_bounded(size, MAX_ROBOT_BYTES, "bytes", origin)
 
 
@@ -191,7 +191,9 @@ def _make_scaled(mesh: Mesh) -> Triangles:
 
 
 def _content(path: Path) -> MeshContent:
-    content = _content_or_fault(str(path.absolute()), _stamp(path))
+    if not path.exists():
+        raise MeshError(f"{path}: no such file or directory")
+    content = _content_or_fault(str(path.absolute()), file_stamp(path))
     if isinstance(content, str):
         raise MeshError(content)
     return content
@@ -244,12 +246,3 @@ def _clean(vertices: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np
     merged.update_faces(np.linalg.norm(normals, axis=1) > 0)
     merged.remove_unreferenced_vertices()
     return np.array(merged.vertices), np.array(merged.faces)
-
-
-def _stamp(path: Path) -> tuple[int, int]:
-    """Return the modification time and size of a file, which tell versions of it apart."""
-    try:
-        status = path.stat()
-    except OSError as error:
-        raise MeshError(f"{path}: {(error.strerror or 'cannot be read').lower()}") from error
-    return status.st_mtime_ns, status.st_size

@@ -77,12 +77,7 @@ class Articulated(ObjectTask[ArticulatedConfig, ArticulatedStartSet]):
         return sample_starts(robot, config, ground, seeds, identity)
 
     def certify(self, goals: ArticulatedStartSet, robot: Robot, scene: Scene) -> list[str]:
-        """Test that the object can be moved as each start says, by the set's configurations.
-
-        Faults, a line each, are joints out of limits, configurations in collision, certificates
-        whose tool is not behind the object or that jump, an object that does not stand on the
-        ground, and a set of another robot.
-        """
+        """Test that the object can be moved as each start says, by the set's configurations."""
         n, dof = len(goals.q), robot.dof
         arrays = [goals.q, goals.path, goals.start, goals.goal, goals.distance, goals.place]
         shapes = [(n, dof), (n, POINTS, dof), (n,), (n,), (n,), (7,)]

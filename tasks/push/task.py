@@ -104,9 +104,6 @@ class Push(ObjectTask[PushConfig, PushStartSet]):
         """Test that every block can be pushed across the line, by the configurations of the set.
 
         Tool positions are computed by MuJoCo, not by our kinematics, which found the certificates.
-        Faults, a line each, are blocks that do not stand on the ground, are past the line or in
-        the base; configurations out of limits or in collision; certificates whose tool is not
-        behind the block, or not on the line; a set of another robot; and ``layout_faults``.
         """
         n = len(goals.blocks)
         configurations = {

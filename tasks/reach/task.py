@@ -144,8 +144,6 @@ class Reach(Task[ReachConfig, ReachGoalSet]):
         """Test that every goal is reachable.
 
         Tool poses are computed by MuJoCo, not by our kinematics, which the goals were made with.
-        Faults, a line each, are configurations out of limits, in collision, in another component of
-        C-space, or with the tool elsewhere; a set of another robot; and ``layout_faults``.
         """
         if goals.q.shape != (len(goals.poses), robot.dof) or goals.poses.shape[1:] != (7,):
             return [

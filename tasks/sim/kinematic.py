@@ -42,8 +42,6 @@ class KinematicSimulation(Simulation):
 
     Joints stay within their limits. Targets are clamped to them, and the response of the law to an
     impulse is never negative: a joint that starts at rest never passes the farthest target.
-
-    Tensors are updated in place; those of blocks are zeros.
     """
 
     def __init__(

@@ -36,6 +36,7 @@ from morphgen.model.kinematics import (
     unwrap_joints,
 )
 from morphgen.model.robot import Frame, Joint, Link, Mimic, Robot
+from morphgen.tasks.rows import angles_between
 
 WORDS = (
     "arm=ur5 ee=plane",
@@ -339,7 +340,7 @@ def test_poses_are_reached_from_random_starts_within_the_limits():
     assert ((low <= q) & (q <= high)).all()
     reached, turned = solver.poses(q)
     assert torch.allclose(error[:, :3], positions - reached, atol=1e-5)
-    angle = 0.2 * batched.angle_between(turned, rotations)
+    angle = 0.2 * angles_between(turned, rotations)
     assert torch.allclose(error[:, 3:].norm(dim=1), angle, atol=2e-3)
     solved = (error.norm(dim=1) < 3e-3).view(len(REACHING), goals, starts).any(dim=2)
     assert (solved.sum(dim=1) >= goals - 1).all()

@@ -13,7 +13,6 @@ from morphgen.model.geometry import Box, Mesh, Pose, Shape
 from morphgen.model.kinematics import joint_limits
 from morphgen.model.robot import TOOL, Frame
 from morphgen.tasks.articulated.envs import GAP, ArticulatedFormulas, object_tables
-from morphgen.tasks.articulated.starts import PathFinder
 from morphgen.tasks.configs import DialConfig, DoorConfig, DrawerConfig, PushConfig, ReachConfig
 from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.goal_sets import set_from_npz, set_npz
@@ -179,23 +178,6 @@ def test_starts_are_free_of_faults_and_the_same_again(task, specs):
     read = set_from_npz(content, type(goals))
     assert set_npz(read) == content
     assert (read.urdf, read.edge, read.scale) == (goals.urdf, goals.edge, goals.scale)
-
-
-def test_places_are_chosen_by_their_first_starts(specs, monkeypatch):
-    """Else a smaller set, which needs no more of them, would be at a place that a larger leaves."""
-    find, batches = PathFinder.__call__, []
-
-    def rarely(self, start, goal):
-        distance, path = find(self, start, goal)
-        if batches:
-            distance[2:] = np.nan
-        batches.append(len(start))
-        return distance, path
-
-    monkeypatch.setattr(PathFinder, "__call__", rarely)
-    large = draw_goals(robot(ROBOT), replace(CONFIGS["dial"], num_goals=40), anew=True)
-    assert len(batches) > 8
-    assert large.place.tolist() == specs["dial"].goals.place.tolist()
 
 
 @each_object
