@@ -9,6 +9,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+from morphgen.benchmark.split_folder import SPLIT_FILE
 from morphgen.errors import FormatError
 from morphgen.files import file_stamp
 from morphgen.formats.bundle import CARD, part_licences
@@ -18,7 +19,7 @@ from morphgen.grammar.catalogue import known_facts, stored_facts
 from morphgen.grammar.library import Library
 from morphgen.grammar.robot_source import is_robot_folder
 from morphgen.grammar.sampling import INDEX, read_index, read_settings
-from morphgen.splits.split import Split, sided_members
+from morphgen.splits.split import Split, sided_members, split_names
 from morphgen.viewer import robot_uri
 
 SORTS = ("order", "name", "dof", "links", "reach", "mass")
@@ -139,6 +140,14 @@ def folder_rows(text: str, files: robot_uri.FileAccess) -> list[Row]:
             f"{text} holds no robot; morphgen sample and morphgen compose make some"
         )
     return rows
+
+
+def source_rows(text: str, files: robot_uri.FileAccess) -> list[Row]:
+    """Return the robots of a split, by its name, file or built folder, or those in a folder."""
+    is_split = text in split_names() or text.endswith(".yaml")
+    if is_split or (files.path(text) / SPLIT_FILE).is_file():
+        return split_rows(text, robot_uri.resolve_split(text, files))
+    return folder_rows(text, files)
 
 
 def robot_folders(root: Path) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -25,14 +24,13 @@ from morphgen.viewer import markup, rollout
 from morphgen.viewer.app.address import MAX_PLAYED, Address, AddressError
 from morphgen.viewer.app.session import Session, bind, set_value
 from morphgen.viewer.pages.gallery import show_index
-from morphgen.viewer.robot_rows import folder_rows, robot_folders, split_rows
+from morphgen.viewer.robot_rows import robot_folders, source_rows
 from morphgen.viewer.robot_uri import (
     DEFAULT_WORDS,
     WORDS,
     FileAccess,
     member_split,
     parent_folder,
-    resolve_split,
     uri_name,
 )
 from morphgen.viewer.rollout import Episode, score_until, snapshot
@@ -119,9 +117,7 @@ class PlayPage:
             seed = gui.add_number("seed", 0, min=0, step=1)
             simulator = gui.add_dropdown("simulator", SIMULATOR_NAMES)
         with gui.add_folder("Robots"):
-            lists = {"trained on": lambda: trained_on} if trained_on else {}
-            offered = robot_lists(robots[0], session.files, lists)
-            picker = RobotPicker(session, offered, lambda: robots[0])
+            picker = RobotPicker(session, lambda: robots[0], trained_on)
             action = gui.add_button_group("this robot", ACTIONS)
         session.keep("policy", lambda: policy.value)  # its default depends on the task
         bind(session, "seed", seed)
@@ -275,20 +271,22 @@ class PlayPage:
         self._fault.content = "".join(markup.error(redact(text)) for text in texts)
 
 
-ARMS = "arms with a plate"
+TRAINED_ON, ARMS = "trained on", "arms with a plate"
 MAX_CHOICES = 500  # robots that a dropdown offers; others can be named by words
 
 Robots = list[tuple[str, str]]  # names and URIs
-RobotLists = Mapping[str, Callable[[], Robots]]  # functions that list robots, by source
 
 
 class RobotPicker:
     """Controls that pick a robot: from a list to search, or by words of the command."""
 
-    def __init__(self, session: Session, lists: RobotLists, current: Callable[[], str]) -> None:
+    def __init__(self, session: Session, current: Callable[[], str], trained_on: Robots) -> None:
         """Add the controls; ``current`` returns the URI of the robot that is shown first."""
-        gui, self._lists, self._current = session.client.gui, lists, current
-        self._source = gui.add_dropdown("from", tuple(lists))
+        gui, self._files = session.client.gui, session.files
+        self._current, self._trained_on = current, trained_on
+        own = [TRAINED_ON] if trained_on else []
+        sources = (*own, *robot_sources(current(), session.files))
+        self._source = gui.add_dropdown("from", sources)
         self.robot = gui.add_dropdown("robot", ("",), hint="type to search")
         hint = "such as arm=ur5 ee=plane, or the folder of a bundle"
         self._words = gui.add_text("or words", "", hint=hint)
@@ -296,10 +294,21 @@ class RobotPicker:
         session.on_change(self._source, self._list_robots)
         self._list_robots()
 
+    def _robots(self) -> Robots:
+        """Return the robots of the chosen source."""
+        if self._source.value == TRAINED_ON:
+            return self._trained_on
+        if self._source.value == ARMS:
+            arms = self._files.library.names("arm")
+            plates = [(arm, f"{WORDS}arm={arm} ee=plane") for arm in arms]
+            return [*plates, ("planar-cube", f"{WORDS}base=planar ee=cube")]
+        rows = source_rows(self._source.value, self._files)
+        return [(f"{row.role}: {row.name}" if row.role else row.name, row.uri) for row in rows]
+
     def _list_robots(self) -> None:
         """Fill the dropdown of robots from the chosen source, each with a label of its own."""
-        current, robots = self._current(), self._lists[self._source.value]()[:MAX_CHOICES]
-        if current and current not in (uri for _, uri in robots):
+        current, robots = self._current(), self._robots()[:MAX_CHOICES]
+        if current not in (uri for _, uri in robots):
             robots = [(current, current), *robots]
         self._uris = {}
         for name, uri in robots:
@@ -307,8 +316,7 @@ class RobotPicker:
                 name += "'"
             self._uris[name] = uri
         self.robot.options = tuple(self._uris)
-        if current:
-            set_value(self.robot, next(name for name, uri in self._uris.items() if uri == current))
+        set_value(self.robot, next(name for name, uri in self._uris.items() if uri == current))
 
     def picked_uri(self) -> str:
         """Return the URI of the robot that the user named or picked, and clear the words."""
@@ -319,33 +327,12 @@ class RobotPicker:
         return WORDS + text if "=" in text and ":" not in text else text
 
 
-def robot_lists(uri: str, files: FileAccess, first: RobotLists) -> RobotLists:
-    """Return lists of robots to pick from, those beside a robot and ``first`` before others."""
-
-    def folder_robots(folder: str) -> Robots:
-        return [(row.name, row.uri) for row in folder_rows(folder, files)]
-
-    def split_robots(split: str) -> Robots:
-        rows = split_rows(split, resolve_split(split, files))
-        return [(f"{row.role}: {row.name}", row.uri) for row in rows]
-
-    def arms() -> Robots:
-        names = files.library.names("arm")
-        plates = [(arm, f"{WORDS}arm={arm} ee=plane") for arm in names]
-        return [*plates, ("planar-cube", f"{WORDS}base=planar ee=cube")]
-
-    lists = dict(first)
-    if split := member_split(uri):
-        lists[split] = functools.partial(split_robots, split)
+def robot_sources(uri: str, files: FileAccess) -> list[str]:
+    """Return the splits and folders to pick robots from; those that have a robot are first."""
     folder = parent_folder(uri)
-    if folder and is_set_folder(files.path(folder)):
-        lists[folder] = functools.partial(folder_robots, folder)
-    lists[ARMS] = arms
-    for name in robot_folders(files.roots[0]):
-        lists.setdefault(name, functools.partial(folder_robots, name))
-    for split in split_names():
-        lists.setdefault(split, functools.partial(split_robots, split))
-    return lists
+    beside = folder if folder and is_set_folder(files.path(folder)) else ""
+    names = (member_split(uri), beside, ARMS, *robot_folders(files.roots[0]), *split_names())
+    return list(dict.fromkeys(filter(None, names)))
 
 
 def default_policy(task: str, *, obstacles: bool) -> str:

@@ -13,7 +13,6 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from morphgen.benchmark.split_folder import SPLIT_FILE
 from morphgen.encoding.similarity import MEASURES, features, similarity_matrix
 from morphgen.encoding.tokens import default_max_links
 from morphgen.errors import MorphgenError
@@ -22,7 +21,7 @@ from morphgen.formats.bundle import split_colours
 from morphgen.grammar.library import Library
 from morphgen.model.robot import Robot
 from morphgen.progress import report
-from morphgen.splits.split import split_id, split_names
+from morphgen.splits.split import split_id
 from morphgen.typing import Array
 from morphgen.viewer import markup, robot_uri
 from morphgen.viewer.app.address import MAX_COMPARED, Address, parse_count
@@ -30,7 +29,7 @@ from morphgen.viewer.app.session import Session, bind, parse_value, set_value
 from morphgen.viewer.app.workers import Workers
 from morphgen.viewer.pages.gallery import show_index
 from morphgen.viewer.robot_files import robot_facts
-from morphgen.viewer.robot_rows import Row, facts_line, folder_rows, split_rows, uri_rows
+from morphgen.viewer.robot_rows import Row, facts_line, source_rows, uri_rows
 from morphgen.viewer.scene import stage
 from morphgen.viewer.scene.population import (
     MAX_SHADOWS,
@@ -58,12 +57,11 @@ class Source:
 
 def find_source(subject: str, files: robot_uri.FileAccess) -> Source:
     """List the robots of a split or a folder."""
-    is_split = subject in split_names() or subject.endswith(".yaml")
-    if is_split or (files.path(subject) / SPLIT_FILE).is_file():
-        split = robot_uri.resolve_split(subject, files)
-        rows = split_rows(subject, split)
-        return Source(tuple(rows[:MAX_ROBOTS]), len(rows), split_id(split))
-    return listed_source(folder_rows(subject, files), files)
+    rows = source_rows(subject, files)
+    if not rows[0].role:
+        return listed_source(rows, files)
+    stamp = split_id(robot_uri.resolve_split(subject, files))
+    return Source(tuple(rows[:MAX_ROBOTS]), len(rows), stamp)
 
 
 def listed_source(rows: Sequence[Row], files: robot_uri.FileAccess) -> Source:
