@@ -21,6 +21,7 @@ from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Link, Robot
 from morphgen.splits.split import find_split, read_split
 from morphgen.viewer.app.address import AddressError
+from morphgen.viewer.pages import population as population_page
 from morphgen.viewer.pages.gallery import parse_range
 from morphgen.viewer.pages.population import (
     compare_robots,
@@ -298,7 +299,8 @@ def test_broken_robots_are_reported_with_their_reason(files):
 
 @pytest.mark.slow
 def test_a_large_population_says_that_it_has_no_shadows(shared_viewer, monkeypatch):
-    monkeypatch.setattr(populations, "MAX_SHADOWS", 10)
+    for module in (populations, population_page):
+        monkeypatch.setattr(module, "MAX_SHADOWS", 10)
     with PlainClient(shared_viewer.port, "?population=robots/prims") as client:
         client.shows("without shadows: more than 10 robots")
         batches = [m for m in client.messages if m["type"] == "BatchedMeshesMessage"]
@@ -412,7 +414,7 @@ def test_split_page_shows_both_sides_the_map_and_the_audit(see):
     page.get_by_text("test (2)").wait_for()
     page.wait_for_selector(".card:has-text('chain-000001') img")
     page.get_by_role("tab", name="Audit").click()
-    page.get_by_text("Findings").wait_for()
+    page.get_by_role("heading", name="Findings").wait_for()
     page.get_by_role("tab", name="Map").click()
     point = page.locator("svg a", has=page.locator("title", has_text="chain-000001"))
     point.first.wait_for()
