@@ -470,12 +470,3 @@ class ObjectTask(Task[OC, G]):
         if success and distance > 0:
             return f"success at {distance:g} m from the {self.target}; expected 0"
         return ""
-
-
-def require_returned(
-    task: str, method: str, result: object, is_expected: bool, expected: str
-) -> None:
-    """Require that a task's method returned what is expected of it."""
-    if not is_expected:
-        returned = type(result).__name__
-        raise TaskError(f"task {task!r}: {method} returned {returned}; expected {expected}")

@@ -22,10 +22,9 @@ from morphgen.tasks.task import (
     Task,
     TaskEnvs,
     TaskState,
-    require_returned,
 )
 
-_FLAGS, _NUMBERS = ("success", "terminated"), ("distance", "score")
+_RESULTS = ("success", "terminated", "distance", "score")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +37,6 @@ class _Group:
 
     def start(self, start: Any, num_joints: int) -> dict[str, torch.Tensor]:  # noqa: ANN401
         """Return what ``TaskEnvs.begin`` returned by name, if that is sound."""
-        expected = "two tensors: joint positions and poses of the block"
-        is_pair = isinstance(start, tuple) and len(start) == 2
-        require_returned(self.task.name, "begin", start, is_pair, expected)
         q, object_pose = start
         self._require("begin: the joint positions", q, num_joints)
         self._require("begin: the poses of the block", object_pose, 7)
@@ -49,14 +45,8 @@ class _Group:
     def result(self, state: TaskState[torch.Tensor]) -> StepResult[torch.Tensor]:
         """Return the result of ``StepFormulas.evaluate``."""
         result = self.envs.formulas.evaluate(state)
-        is_result = isinstance(result, StepResult)
-        require_returned(self.task.name, "evaluate", result, is_result, "a StepResult")
-        if not result.terms:
-            raise TaskError(
-                f"task {self.task.name!r}: evaluate: no reward terms; expected one or more"
-            )
-        for name in (*_FLAGS, *_NUMBERS):
-            self._require(f"evaluate: {name}", getattr(result, name), is_flag=name in _FLAGS)
+        for name in _RESULTS:
+            self._require(f"evaluate: {name}", getattr(result, name))
         for name, value in result.terms.items():
             self._require(f"evaluate: the reward term {name!r}", value)
         return result
@@ -65,24 +55,21 @@ class _Group:
         """Return what ``StepFormulas.observe`` does: a value for each field of the task."""
         values = self.envs.formulas.observe(object_pose)
         sizes = {field.name: field.size for field in self.task.fields}
-        for name in sizes.keys() ^ values.keys():
-            fault = f"the field {name!r} is missing"
-            if name in values:
-                fault = f"{name!r} is no ObservationField in the task's `fields`"
-            raise TaskError(f"task {self.task.name!r}: observe: {fault}")
+        if sizes.keys() != values.keys():
+            raise TaskError(
+                f"task {self.task.name!r}: observe returned {', '.join(values)}; expected the "
+                f"task's `fields`: {', '.join(sizes)}"
+            )
         for name, value in values.items():
             self._require(f"observe: the field {name!r}", value, sizes[name])
         return values
 
-    def _require(self, part: str, value: object, *size: int, is_flag: bool | None = None) -> None:
-        """Require a tensor with a row per environment, and of flags or numbers if that matters."""
-        part, shape = f"task {self.task.name!r}: {part}", (len(self.rows), *size)
-        if not isinstance(value, torch.Tensor):
-            raise TaskError(f"{part}: {type(value).__name__}; expected a tensor")
-        if tuple(value.shape) != shape:
-            raise TaskError(f"{part} has shape {tuple(value.shape)}; expected {shape}")
-        if is_flag is not None and is_flag != (value.dtype == torch.bool):
-            raise TaskError(f"{part} is {value.dtype}; expected {'bool' if is_flag else 'numbers'}")
+    def _require(self, part: str, value: torch.Tensor, *size: int) -> None:
+        """Require a row per environment, lest other shapes are broadcast."""
+        if tuple(value.shape) != (shape := (len(self.rows), *size)):
+            raise TaskError(
+                f"task {self.task.name!r}: {part} has shape {tuple(value.shape)}; expected {shape}"
+            )
 
 
 class TaskGroups:
@@ -114,7 +101,6 @@ class TaskGroups:
             pairs = [(env, member_of[i]) for env, i in enumerate(index) if i in member_of]
             rows, member_index = torch.tensor(pairs, device=device).T.contiguous()
             envs = task.make_envs([specs[i] for i in members], member_index, num_joints)
-            require_returned(name, "make_envs", envs, isinstance(envs, TaskEnvs), "TaskEnvs")
             if not isinstance(getattr(envs, "formulas", None), StepFormulas):
                 kind = type(envs).__name__
                 raise TaskError(f"task {name!r}: {kind} has no `formulas`; expected StepFormulas")
@@ -174,7 +160,7 @@ class TaskGroups:
         angles = [{} if each.angle is None else {"angle": each.angle} for each in results]
         merged = self._merged(
             [
-                {name: getattr(result, name) for name in (*_FLAGS, *_NUMBERS)}
+                {name: getattr(result, name) for name in _RESULTS}
                 | {"reward": torch.stack([*result.terms.values()]).sum(dim=0)}
                 for result in results
             ]
