@@ -8,23 +8,21 @@
 A row is one update: a rollout of 128 control steps in every environment, and four epochs of 16
 minibatches. Within a simulator and number of threads all rows share:
 
-- the environments: reach of one robot, a new batch with the same padding and the same staggered
-  episodes; stable-baselines3 gets it through ``morphgen.tasks.gym.sb3.SB3Vector``. Continuous
-  actions.
+- the environments: reach of one robot, a new batch without padding; stable-baselines3 gets it
+  through ``morphgen.tasks.gym.sb3.SB3Vector``. Continuous actions.
 - rollout length, environments, epochs, minibatches and minibatch size, and thus gradient steps;
   clip range, discount, GAE lambda, entropy weight, Adam; separate value and policy networks.
 - torch threads, and in MuJoCo as many threads of the simulator; PyBullet has one.
 
 "same network" uses our MLP of ``se`` as features extractor of stable-baselines3, one for the policy
-and one for values, each with a linear layer; the script checks that the number of parameters is
-equal. "own MLP" is the default of stable-baselines3: the flattened observation and as many tanh
-layers of the same width. "Gymnasium" also has that network, and as many ``morphgen/Reach-v0``
-environments in a ``DummyVecEnv``: the usual way without our batch. Those have no padding, so that
-the network is smaller, and no workers.
+and one for values, each with a linear layer; the script checks that the number of parameters before
+it is equal. "own MLP" is the default of stable-baselines3: the flattened observation and as many
+tanh layers of the same width. "Gymnasium" also has that network, and as many ``morphgen/Reach-v0``
+environments in a ``DummyVecEnv``: the usual way without our batch, and without workers.
 
-Differences that remain: morphgen computes values again over the whole rollout before learning,
-keeps an exponential moving average of the critic, and clips the gradients of policy and values
-separately. The paper's symlog and slow critic are off.
+Differences that remain: morphgen staggers the episodes of a batch, computes values again over the
+whole rollout before learning, keeps an exponential moving average of the critic, and clips the
+gradients of policy and values separately. The paper's symlog and slow critic are off.
 
 Every round measures all rows in turn, after one update that is not counted. Figures are medians.
 
@@ -216,15 +214,20 @@ def _beside(robot: str, sim: Any, envs: int, threads: int, rounds: int) -> Itera
     with ExitStack() as stack:
 
         def batch() -> TaskBatch:
-            made = make_batch("reach", [body], envs, sim=sim, workers=workers)
+            # Without padding, which SB3Vector leaves out.
+            links = len(body.links)
+            made = make_batch("reach", [body], envs, sim=sim, workers=workers, max_links=links)
             stack.callback(made.close)
             return made
 
         learner = Learner(batch(), SE, PLAIN)
         updates: dict[str, Update] = {"morphgen": partial(_own_update, learner)}
         if find_spec("stable_baselines3") is not None:
+            from morphgen.tasks.gym.sb3 import SB3Vector
+            from morphgen.tasks.gym.vector import TaskVector
+
             for name, like in (("same network", learner), ("own MLP", None)):
-                updates[f"stable-baselines3, {name}"] = _peer(_spread(batch()), like)
+                updates[f"stable-baselines3, {name}"] = _peer(SB3Vector(TaskVector(batch())), like)
             single = _single(body, sim, envs)
             stack.callback(single.close)
             updates["stable-baselines3, own MLP, Gymnasium"] = _peer(single, None)
@@ -319,18 +322,6 @@ def _peer(envs: Any, learner: Learner | None) -> Update:  # noqa: ANN401
     return update
 
 
-def _spread(batch: TaskBatch) -> Any:  # noqa: ANN401 - a class of what may not be installed
-    """Return the batch for stable-baselines3, with staggered episodes like a learner's."""
-    from morphgen.tasks.gym.sb3 import SB3Vector
-    from morphgen.tasks.gym.vector import TaskVector, numpy_observation
-
-    class Spread(SB3Vector):
-        def reset(self) -> dict[str, Any]:
-            return numpy_observation(self.vector.batch.reset(spread=True))
-
-    return Spread(TaskVector(batch))
-
-
 def _single(robot: Robot, sim: Any, envs: int) -> Any:  # noqa: ANN401
     """Return Gymnasium environments, one after the other in one process."""
     import gymnasium
@@ -347,24 +338,40 @@ def _extractor() -> type[Any]:
     class Extractor(BaseFeaturesExtractor):
         def __init__(self, space: Any, like: Observation) -> None:  # noqa: ANN401
             super().__init__(space, SIZES.mlp_width)
-            self.kinds = {name: (each.dtype, each.shape[1:]) for name, each in like.items()}
+            # "actions" has a column for each link in `like`, and for each joint in the space; no
+            # layer reads it. The space lacks what has no rows.
+            self.kinds = {
+                name: (each.dtype, each.shape[1:])
+                for name, each in like.items()
+                if name != "actions" and name in space.spaces
+            }
             self.network = mlp.Network(SE, layout_of(like), 1, per_link=False)
             self.network.leave = cast(torch.nn.Linear, torch.nn.Identity())
             self.network.shape = (SIZES.mlp_width,)
 
         def forward(self, seen: Observation) -> torch.Tensor:
-            restored = {}
-            for name, each in seen.items():
-                dtype, shape = self.kinds[name]
-                restored[name] = each.to(dtype).reshape(-1, *shape)
+            restored = {
+                name: seen[name].to(dtype).reshape(-1, *shape)
+                for name, (dtype, shape) in self.kinds.items()
+            }
             return cast(torch.Tensor, self.network(restored))
 
     return Extractor
 
 
 def _parameters(*networks: torch.nn.Module) -> int:
-    """Return the number of learned parameters."""
-    return sum(each.numel() for network in networks for each in network.parameters())
+    """Return the number of learned parameters before the last layers.
+
+    The last layer of a policy has an output for each link in morphgen, and for each joint in
+    stable-baselines3.
+    """
+    last = {"leave", "action_net", "value_net", "log_std", "raw_log_std"}
+    return sum(
+        each.numel()
+        for network in networks
+        for name, each in network.named_parameters()
+        if last.isdisjoint(name.split("."))
+    )
 
 
 def _learners(device: str, envs: int, rounds: int) -> list[Row]:
