@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from inspect import signature
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,16 +19,14 @@ from morphgen.errors import TaskError, nearest, whole_number
 from morphgen.grammar.robot_source import RobotLike
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step, TaskBatch
-from morphgen.tasks.observation import Observation, ObservationConfig
+from morphgen.tasks.observation import Observation
 from morphgen.tasks.registry import KINEMATIC_CHANNELS, TASKS, register_gym_envs
 from morphgen.tasks.scenes.env_specs import GoalConfig, task_configs
 from morphgen.tasks.scenes.make import BatchOptions, make_batch
-from morphgen.tasks.sim.base import Contacts
 from morphgen.tasks.task import BOUND, TaskConfig
 
 register_gym_envs()  # morphgen.tasks may have been imported before Gymnasium
 
-T = TypeVar("T")
 LINK_ENTRIES = ("tokens", "velocity", *KINEMATIC_CHANNELS)
 """Entries of observations with a row for each link."""
 _INFO_KEYS = ("success", "distance", "score", "diverged")
@@ -86,18 +84,6 @@ def episode_limit(given: int | None, task: str, options: Mapping[str, Any]) -> i
     return given
 
 
-def from_mapping(
-    name: str, make: Callable[..., T], value: T | Mapping[str, Any] | None
-) -> T | None:
-    """Return an argument that may be a dictionary, as in JSON, as the object that it describes."""
-    if not isinstance(value, Mapping):
-        return value
-    try:
-        return make(**value)
-    except TypeError as error:
-        raise TaskError(f"{name} {dict(value)}: {error}") from error
-
-
 OPTIONS = frozenset(
     {*signature(make_batch).parameters, *BatchOptions.__optional_keys__}
     - {"task", "robots", "num_envs", "options"}
@@ -112,20 +98,19 @@ def batch_options(
     options: Mapping[str, Any],
     valid: frozenset[str],
 ) -> dict[str, Any]:
-    """Return keyword arguments of ``make_batch`` from options that may be dictionaries, as in JSON.
-
-    They include the task's constants, ``config``.
-    """
+    """Return keyword arguments of ``make_batch``: options, and a ``config``, also as in JSON."""
     for name in options:
         if name not in valid:
             hint = nearest(name, valid | {"config", "render_mode", "robot", "size"})
             raise TaskError(f"{what}: unknown option {name!r}{hint}")
     given = dict(options)
-    for name, make in (("observe", ObservationConfig), ("contacts", Contacts)):
-        given[name] = from_mapping(name, make, given.get(name))
     kind = TASKS[task].config_type
+    if isinstance(config, Mapping):
+        try:
+            (config,) = task_configs({task: config})
+        except TypeError as error:
+            raise TaskError(f"config {config}: {error}") from error
     if config is not None:
-        config = from_mapping("config", lambda **values: task_configs({task: values})[0], config)
         if not isinstance(config, kind):
             raise TaskError(
                 f"{type(config).__name__} is not the config of {task}: expected {kind.__name__}"

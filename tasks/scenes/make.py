@@ -178,6 +178,8 @@ def batch_from_specs(
     """Make a batch of environments from their specifications."""
     if observe is not None and not isinstance(observe, ObservationConfig):
         raise TaskError(f"observe {observe!r}: expected an ObservationConfig")
+    if contacts is not None and not isinstance(contacts, Contacts):
+        raise TaskError(f"contacts {contacts!r}: expected Contacts")
     simulator = SIMULATORS[sim or DEFAULT_SIMULATOR]
     if workers is None:
         workers = simulator.default_workers(num_envs)
