@@ -38,9 +38,8 @@ from morphgen.viewer.robot_uri import member_uri, read_robot_uri
 from morphgen.viewer.scene import population as populations
 from morphgen.viewer.scene.population import (
     ReadRobot,
-    all_roles,
-    joint_roles,
     make_population,
+    numbered_joints,
     shape_poses,
 )
 from morphgen.viewer.scene.robot import robot_bounds
@@ -203,15 +202,14 @@ def test_large_meshes_are_simplified_although_their_arrays_are_read_only():
     assert len(populations.surface(large)[1]) <= populations.MAX_FACES
 
 
-def test_a_role_moves_in_every_robot_by_the_same_share(population):
-    q = populations.move_roles(population, population.home, {"joint 1": 1.0, "joint 2": 0.25})
+def test_a_joint_moves_in_every_robot_by_the_same_share(population):
+    q = populations.move_joints(population, population.home, {1: 1.0, 2: 0.25})
     for i, robot in enumerate(population.robots):
         expected, (low, high) = np.array(robot.home), joint_limits(robot).T
-        for k, role in enumerate(joint_roles(robot)):
-            if share := {"joint 1": 1.0, "joint 2": 0.25}.get(role):
-                expected[k] = low[k] + share * (high[k] - low[k])
+        for k, share in zip(numbered_joints(robot), (1.0, 0.25), strict=False):
+            expected[k] = low[k] + share * (high[k] - low[k])
         np.testing.assert_allclose(q[i, : robot.dof], expected)
-    still = populations.move_roles(population, population.home, {})
+    still = populations.move_joints(population, population.home, {})
     np.testing.assert_array_equal(still, population.home)
 
 
@@ -348,11 +346,9 @@ def robot_of(words):
     return compose(derivation, LIBRARY, name)
 
 
-def test_joint_roles_count_joints_on_the_path_to_the_tool():
-    assert joint_roles(arm()) == ["joint 1", "joint 2", "joint 3", "finger 1"]
-    panda = robot_of("arm=panda ee=panda_hand")
-    assert joint_roles(panda) == [f"joint {i}" for i in range(1, 8)] + ["finger 1"]
-    assert all_roles([arm(), panda]) == [f"joint {i}" for i in range(1, 8)] + ["finger 1"]
+def test_joints_on_the_path_to_the_tool_are_numbered_or_else_all():
+    assert numbered_joints(arm()) == (0, 1, 2)
+    assert numbered_joints(replace(arm(), frames=())) == (0, 1, 2, 3)
 
 
 def test_robot_compared_with_itself_is_identical():

@@ -38,7 +38,7 @@ from morphgen.viewer.scene.population import (
     ReadRobot,
     arrange,
     make_population,
-    move_roles,
+    move_joints,
 )
 from morphgen.viewer.scene.robot import robot_bounds
 
@@ -185,9 +185,11 @@ class PopulationPage:
         home = gui.add_button("Home", icon=viser.Icon.HOME)
         bind(session, "arrange", self._arrange, tuple(ARRANGEMENTS))
         session.keep("select", lambda: format_selection(self.selected), self._apply_selection)
-        self._moved: dict[str, float] = {}  # shares of their ranges, of the roles that were moved
+        self._moved: dict[int, float] = {}  # shares of their ranges, by the numbers of joints
         self._sliders: list[viser.GuiSliderHandle[float]] = []
-        self._add_sliders()
+        with gui.add_folder("Joints from the base to the tool"):
+            for number in range(1, int(population.number.max(initial=0)) + 1):
+                self._add_slider(number)
         self._selection = gui.add_html("")
         select = gui.add_button_group("Select", ("all", "none"))
         choose = gui.add_button(
@@ -247,39 +249,29 @@ class PopulationPage:
         uris = (row.uri for row in self._selected_rows)
         self.session.choose((*self.session.chosen, *uris))
 
-    def _add_sliders(self) -> None:
-        gui, roles, role = self.session.client.gui, self.population.roles, self.population.role
-        for title, initial in (
-            ("Joints from the base to the tool", "j"),
-            ("Fingers and others", "f"),
-        ):
-            if names := [name for name in roles if name[0] == initial]:
-                with gui.add_folder(title, expand_by_default=initial == "j"):
-                    for name in names:
-                        count = int((role == roles.index(name)).any(axis=1).sum())
-                        self._add_slider(name, f"share of its range, of {count} robots")
-
-    def _add_slider(self, role: str, hint: str) -> None:
-        """Add the slider of a role, which is in the middle while nobody has moved it."""
+    def _add_slider(self, number: int) -> None:
+        """Add the slider of a joint, which is in the middle while nobody has moved it."""
         session, moved = self.session, self._moved
-        slider = session.client.gui.add_slider(role, 0.0, 1.0, 0.01, MIDDLE, hint=hint)
+        count = int((self.population.number == number).any(axis=1).sum())
+        hint = f"share of its range, of {count} robots"
+        slider = session.client.gui.add_slider(f"joint {number}", 0.0, 1.0, 0.01, MIDDLE, hint=hint)
         self._sliders.append(slider)
 
         def apply(text: str) -> None:
             """Take over a position of an address, unless it is invalid; the robots move later."""
             if (position := parse_value(slider, text)) is not None:
-                moved[role] = position
+                moved[number] = position
                 set_value(slider, position)
 
         def read() -> None:
-            moved[role] = slider.value
+            moved[number] = slider.value
             self._move()
 
         def write() -> str:
-            return f"{moved[role]:g}" if role in moved else ""
+            return f"{moved[number]:g}" if number in moved else ""
 
-        session.on_change(slider, read, f"move {role}")
-        session.keep(role.replace(" ", ""), write, apply)
+        session.on_change(slider, read, f"move {number}")
+        session.keep(f"joint{number}", write, apply)
 
     def _go_home(self) -> None:
         self._moved.clear()
@@ -289,7 +281,7 @@ class PopulationPage:
 
     def _configurations(self) -> NDArray[np.float64]:
         """Return the configurations of all robots, shape (n, J) [rad or m]."""
-        return move_roles(self.population, self.population.home, self._moved)
+        return move_joints(self.population, self.population.home, self._moved)
 
     def _move(self) -> None:
         self.scene.move(self.scene.positions, self._configurations())

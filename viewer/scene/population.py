@@ -8,7 +8,7 @@ sorted by what they are instances of.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,9 +56,7 @@ class Population:
     lower: Array  # lower joint limits, padded with 0, shape (n, J) [rad or m]
     upper: Array  # upper joint limits, padded with 0, shape (n, J) [rad or m]
     home: Array  # home configurations within the limits, padded with 0, shape (n, J) [rad or m]
-    roles: tuple[str, ...]  # roles of the joints of any robot; see `joint_roles`
-    role: NDArray[np.intp]  # index into `roles`, shape (n, J); `len(roles)` for padding
-
+    number: NDArray[np.intp]  # number of each joint, see `numbered_joints`, shape (n, J); else 0
     home_bounds: Array  # lowest and highest corners at home, shape (n, 2, 3) [m]
 
     def __len__(self) -> int:
@@ -74,39 +72,25 @@ class ReadRobot:
     bounds: Array  # lowest and highest corner at home, shape (2, 3) [m]
 
 
-def joint_roles(robot: Robot) -> list[str]:
-    """Return the role of every independent joint: ``joint 1`` is the first that moves the tool.
-
-    Others, such as ``finger 1``, do not.
-    """
-    on_path: tuple[int, ...] = ()
+def numbered_joints(robot: Robot) -> tuple[int, ...]:
+    """Return the indices in q of joint 1, joint 2, ...: those that move the tool, or else all."""
     if robot.tool:
-        on_path = driving_joints(robot, robot.joint_chain(robot.frame(TOOL).link))
-    off_path = [i for i in range(robot.dof) if i not in on_path]
-    roles = {i: f"joint {n}" for n, i in enumerate(on_path, 1)}
-    roles |= {i: f"finger {n}" for n, i in enumerate(off_path, 1)}
-    return [roles[i] for i in range(robot.dof)]
-
-
-def all_roles(robots: Sequence[Robot]) -> list[str]:
-    """Return every role of any of the robots, joints before fingers, by number."""
-    roles = {role for robot in robots for role in joint_roles(robot)}
-    return sorted(roles, key=lambda role: (role[0] != "j", int(role.split()[1])))
+        return driving_joints(robot, robot.joint_chain(robot.frame(TOOL).link))
+    return tuple(range(robot.dof))
 
 
 def make_population(read: Sequence[ReadRobot]) -> Population:
     """Compile robots, at least one."""
     robots = tuple(each.robot for each in read)
     n, most = len(robots), max(robot.dof for robot in robots)
-    roles = all_roles(robots)
-    index = {role: i for i, role in enumerate(roles)}
     lower, upper, home = np.zeros((3, n, most))
-    role = np.full((n, most), len(roles), dtype=np.intp)
+    number = np.zeros((n, most), dtype=np.intp)
     for i, robot in enumerate(robots):
         dof = robot.dof
         lower[i, :dof], upper[i, :dof] = joint_limits(robot).T
         home[i, :dof] = robot.home
-        role[i, :dof] = [index[name] for name in joint_roles(robot)]
+        for k, joint in enumerate(numbered_joints(robot), 1):
+            number[i, joint] = k
     return Population(
         tuple(each.row for each in read),
         robots,
@@ -115,8 +99,7 @@ def make_population(read: Sequence[ReadRobot]) -> Population:
         lower,
         upper,
         np.clip(home, lower, upper),
-        tuple(roles),
-        role,
+        number,
         np.array([each.bounds for each in read]),
     )
 
@@ -155,10 +138,11 @@ def shape_poses(population: Population, q: Array) -> NDArray[np.float32]:
     return np.asarray(T_root_link[instances.robot, instances.link] @ instances.T_link_shape)
 
 
-def move_roles(population: Population, q: Array, shares: dict[str, float]) -> Array:
-    """Return configurations (n, J) with some roles' joints moved to shares of their ranges."""
-    values = np.array([shares.get(role, np.nan) for role in population.roles] + [np.nan])
-    share = values[population.role]
+def move_joints(population: Population, q: Array, shares: Mapping[int, float]) -> Array:
+    """Return configurations (n, J) with joints of some numbers moved to shares of their ranges."""
+    share = np.full(population.number.shape, np.nan)
+    for number, value in shares.items():
+        share[population.number == number] = value
     moved = population.lower + share * (population.upper - population.lower)
     return np.where(np.isnan(share), q, moved)
 
