@@ -23,9 +23,9 @@ machine opens them. Times in seconds:
 
 Prints the server's time for one slider move of that page with collision tests [ms], median and 95th
 percentile, for a slider that the browser moves every 30 ms. Prints the memory of the server without
-its workers at its first page and with a gallery of many robots, 96 per page (Linux).
+its workers at its first page and with a gallery of many robots (Linux).
 
-For the population page with 100 and with 1000 arm3, all moved by the slider of one joint role: the
+For the population page with 100 and with 1000 arm3, all moved by the slider of one joint: the
 server's time of a move (kinematics of all robots, and the messages), the bytes that the browser
 gets for it, the draw calls of a frame, and the time between frames while the camera turns, in
 headless chromium with software GL. A browser with a GPU draws the same calls in a fraction.
@@ -266,9 +266,9 @@ def _memory(browser: Any, folder: Path, many: int) -> list[Row]:  # noqa: ANN401
         page.goto(address)
         page.locator(".card").first.wait_for()
         before = resident(process)
-        page.goto(f"{address}/?gallery=robots/many&size=96")
+        page.goto(f"{address}/?gallery=robots/many")
         page.get_by_text(f"{many} robots").first.wait_for()
-        page.wait_for_function(f"document.querySelectorAll('{CARD}').length == {min(many, 96)}")
+        wait_for_cards(page)
         return [
             ("memory of the server at its first page", f"{before / 2**20:.0f} MB"),
             (f"with a gallery of {many} robots", f"{resident(process) / 2**20:.0f} MB"),
