@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from lxml import etree
@@ -21,15 +21,10 @@ from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import TOOL, Frame, Pair, Robot, sorted_pair
 from morphgen.model.tree import below
 
-Reason = Literal["Adjacent", "Default", "Always", "Never", "User"]
-REASONS: tuple[Reason, ...] = ("Adjacent", "Default", "Always", "Never", "User")
-"""Reasons in the order in which they apply; a pair gets the first one."""
 MATRIX_SAMPLES = 10_000  # number of sampled configurations, the default of MoveIt's setup assistant
 
 
-def collision_matrix(
-    robot: Robot, *, samples: int = MATRIX_SAMPLES, seed: int = 0
-) -> dict[Pair, Reason]:
+def collision_matrix(robot: Robot, samples: int = MATRIX_SAMPLES) -> dict[Pair, str]:
     """Return pairs of links whose collisions need no test, with the reasons of docs/bundle.md.
 
     As in all collision checks, meshes count as their convex hulls. These contain their meshes, so a
@@ -41,12 +36,12 @@ def collision_matrix(
     checker = SelfCollisionChecker(loose, ())
     q = np.zeros((samples + 1, loose.dof))  # the first row is home
     q[0, columns] = robot.home
-    q[1:, columns] = random_configurations(robot, samples, np.random.default_rng(seed))
+    q[1:, columns] = random_configurations(robot, samples, np.random.default_rng(0))
     penetrations = checker.penetrations(q)
     at_home = next(penetrations)
     collisions = Counter(pair for depths in penetrations for pair in depths)
     adjacent = set(adjacent_pairs(loose))  # as in MoveIt, links on fixed joints are not merged
-    reasons: dict[Pair, Reason] = dict.fromkeys(robot.ignore_pairs, "User")
+    reasons: dict[Pair, str] = dict.fromkeys(robot.ignore_pairs, "User")
     for pair in pairs:
         if pair in adjacent:
             reasons[pair] = "Adjacent"
@@ -73,7 +68,7 @@ def _with_loose_joints(robot: Robot) -> tuple[Robot, list[int]]:
     return loose, [independent.index(k) for k in robot.independent_joints]
 
 
-def robot_srdf_text(robot: Robot, *, samples: int = MATRIX_SAMPLES, seed: int = 0) -> str:
+def robot_srdf_text(robot: Robot, samples: int = MATRIX_SAMPLES) -> str:
     """Return the SRDF of a robot as text.
 
     Every tool has a group ``arm``, the chain from the root, and ``ee`` if it has an end-effector:
@@ -82,7 +77,7 @@ def robot_srdf_text(robot: Robot, *, samples: int = MATRIX_SAMPLES, seed: int = 
     spheres alone have them as a ``link_sphere_approximation``.
     """
     require_tool(robot)
-    reasons = collision_matrix(robot, samples=samples, seed=seed)
+    reasons = collision_matrix(robot, samples)
     root = etree.Element("robot", name=robot.name)
     _write_limbs(root, robot, [*_limbs(robot)])
     for link in robot.links:

@@ -16,12 +16,13 @@ from morphgen.cli.progress import bar, print_line, track
 from morphgen.errors import FormatError, MorphgenError
 from morphgen.fitting.link_fit import FitOptions, LinkFit, Quality
 from morphgen.fitting.replace_collision import fit_robot, mesh_robot
-from morphgen.fitting.robot_fit import FitReport, parts_with_meshes, store_parts
+from morphgen.fitting.robot_fit import FitReport, parts_without_fits, store_part
 from morphgen.formats.bundle import bundle_folder, require_replaceable, write_bundle
 from morphgen.grammar.part import load_part
 from morphgen.grammar.robot_source import RobotReference, is_robot_file
 from morphgen.model.geometry import MESH_SUFFIXES
 from morphgen.model.robot import Robot
+from morphgen.processes import parallel_map
 from morphgen.tables import table
 
 COLUMNS = {
@@ -51,8 +52,9 @@ def fit(args: argparse.Namespace) -> None:
         raise MorphgenError("name a part, a robot or a mesh file, or say --all")
     options = FitOptions(**opt.given(args, (each.name for each in fields(FitOptions))))
     if args.all:
-        parts = parts_with_meshes(opt.library_of(args), missing=args.missing)
-        for path in track(store_parts(parts, jobs=args.jobs), args, "fitting", "part", len(parts)):
+        parts = parts_without_fits(opt.library_of(args))
+        paths = parallel_map(store_part, parts, args.jobs, chunk=1)
+        for path in track(paths, args, "fitting", "part", len(parts)):
             print_line(str(path))
         return
     targets = _targets(args)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -132,9 +132,9 @@ def _try_fit(options: FitOptions, work: tuple[tuple[Shape, ...], Solid]) -> Link
         return error
 
 
-def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manifest]:
-    """Return unscaled parts with meshes; with ``missing``, those whose fits are not all stored."""
-    stored = fit_files.read_stored_fits(library.folders) if missing else {}
+def parts_without_fits(library: Library) -> list[Manifest]:
+    """Return unscaled parts with meshes whose fits are not all stored."""
+    stored = fit_files.read_stored_fits(library.folders)
     return [
         manifest
         for manifest in library.manifests()
@@ -145,11 +145,6 @@ def parts_with_meshes(library: Library, *, missing: bool = False) -> list[Manife
 def _mesh_keys(manifest: Manifest) -> set[str]:
     shapes = (link.solid_shapes for link in load_part(manifest).fragment.links)
     return {fit_files.shapes_key(each) for each in shapes if fit_files.has_meshes(each)}
-
-
-def store_parts(manifests: Sequence[Manifest], *, jobs: int = 1) -> Iterator[Path]:
-    """Fit and store several parts; yield the path of each file when it is written."""
-    yield from parallel_map(store_part, manifests, jobs, chunk=1)
 
 
 def store_part(manifest: Manifest) -> Path:

@@ -112,8 +112,8 @@ def nothing_is_stored(monkeypatch):
     def forbidden(*_, **__):
         raise AssertionError("a test was about to store the fits of the library's parts")
 
-    monkeypatch.setattr("morphgen.cli.fit.parts_with_meshes", forbidden)
-    monkeypatch.setattr("morphgen.cli.fit.store_parts", forbidden)
+    monkeypatch.setattr("morphgen.cli.fit.parts_without_fits", forbidden)
+    monkeypatch.setattr("morphgen.cli.fit.store_part", forbidden)
 
 
 @pytest.fixture

@@ -65,7 +65,6 @@ fit lost.stl => lost.stl: no such file
 fit flat.obj => robot 'flat': link flat: no primitive can stand for its shapes
 fit bare.urdf => robot 'r': no link has a shape
 fit plane --iou 0.9 => --iou: only with --max-primitives
-fit plane --missing => --missing: only with --all
 fit plane --cover 0.9 => --cover: only with --spheres
 fit plane --spheres 4 --max-primitives 2 => --max-primitives: only without --spheres
 fit --all --max-primitives 2 --seed 3 => --max-primitives --seed: only without --all

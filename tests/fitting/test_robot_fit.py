@@ -22,7 +22,7 @@ from morphgen.fitting.robot_fit import (
     COLLISION_OPTIONS,
     TOKEN_OPTIONS,
     fit_links,
-    parts_with_meshes,
+    parts_without_fits,
 )
 from morphgen.fitting.solid import solid_of
 from morphgen.fitting.token_shapes import token_shapes
@@ -149,7 +149,7 @@ def test_a_link_that_cannot_be_fitted_is_an_error(tmp_path):
 
 @pytest.mark.slow
 def test_every_real_part_has_stored_fits():
-    assert [m.name for m in parts_with_meshes(LIBRARY, missing=True)] == []
+    assert [m.name for m in parts_without_fits(LIBRARY)] == []
 
 
 TEMPLATE = """\
@@ -188,7 +188,7 @@ def own_parts(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_template_with_a_mesh_is_fitted_stored_and_used(own_parts, monkeypatch, capsys):
-    assert main(["fit", "--all", "--missing", "--library", str(own_parts)]) == 0
+    assert main(["fit", "--all", "--library", str(own_parts)]) == 0
     stored = own_parts / f"my_wedge{SUFFIX}"
     assert [path.name for path in own_parts.glob(f"*{SUFFIX}")] == [stored.name]
     monkeypatch.setattr(token_shapes_module, "fit_primitive", lambda shapes: pytest.fail("search"))
@@ -197,7 +197,7 @@ def test_a_template_with_a_mesh_is_fitted_stored_and_used(own_parts, monkeypatch
     assert token.geometry.size == pytest.approx((0.04, 0.06, 0.1), abs=2e-3)
     assert as_primitives(robot, ()).link("ee_wedge").collisions
     before = stored.stat().st_mtime_ns
-    assert main(["fit", "--all", "--missing", "--library", str(own_parts)]) == 0
+    assert main(["fit", "--all", "--library", str(own_parts)]) == 0
     assert stored.stat().st_mtime_ns == before
 
 
