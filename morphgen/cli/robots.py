@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -14,7 +14,6 @@ from morphgen.cli.progress import bar, status
 from morphgen.errors import CompositionError, FormatError
 from morphgen.formats.bundle import CARD, URDF, bundle_folder, write_bundle
 from morphgen.formats.data_files import read_json
-from morphgen.formats.description import find_description
 from morphgen.grammar.compose import compose as compose_parts
 from morphgen.grammar.part import part_manifest, write_part
 from morphgen.grammar.request import parse_words
@@ -146,7 +145,9 @@ def _facts(robot: Robot) -> dict[str, object]:
 
 
 def import_robot(args: argparse.Namespace) -> int:
-    """Import a description, check it and write its bundle."""
+    """Import a description, check it, and write its bundle and, if asked for, its manifest."""
+    from morphgen.grammar import robot_source
+
     if args.name is not None:
         bundle_folder(args.out, args.name)  # refuses an invalid name before the work
     if args.root is not None and not args.root.is_dir():
@@ -154,9 +155,34 @@ def import_robot(args: argparse.Namespace) -> int:
             f"--root {args.root}: no such folder; the link where the robot begins is named by "
             "--root-link"
         )
-    xacro_args = _xacro_args(args.arg)
-    path, own_args = find_description(args.file)
-    data, text, code = _import(path, {**own_args, **xacro_args}, args)
+    if args.part and not args.licence:
+        raise FormatError("--part: name the robot's licence by --licence, such as MIT")
+    with status(args, f"importing {args.file}"):
+        robot = robot_source.import_robot(
+            args.file,
+            _xacro_args(args.arg),
+            root=args.root,
+            root_link=args.root_link,
+            tool=args.tool,
+            srdf=args.srdf,
+            name=args.name,
+            repair=not args.as_is,
+            skip_missing_meshes=args.skip_missing_meshes,
+        )
+    folder = bundle_folder(args.out, robot.name)
+    if args.file.resolve().is_relative_to(folder.resolve()):
+        raise FormatError(
+            f"{args.file}: its bundle would replace {folder}, the folder that it is in; "
+            "choose another --name or --out"
+        )
+    part = None
+    if args.part:  # refuses before the bundle is replaced
+        part = part_manifest(robot, folder / URDF, args.part, args.parts or _PARTS, args.licence)
+    data, text, code = write_checked(robot, args)
+    if part is not None:
+        write_part(*part)
+        path = str(part[0])
+        data, text = {**data, "part": path}, f"{text}\n{path}"
     opt.print_result(args, data, lambda: text)
     return code
 
@@ -168,38 +194,3 @@ def _xacro_args(words: Sequence[str]) -> dict[str, str]:
         if not key or not equals:
             raise FormatError(f"--arg {key}{equals}{value}: expected NAME=VALUE")
     return {key: value for key, _, value in pairs}
-
-
-def _import(path: Path, xacro_args: Mapping[str, str], args: argparse.Namespace) -> Written:
-    """Import a robot, and write its bundle and, if asked for, its manifest."""
-    from morphgen.grammar import robot_source
-
-    if args.part and not args.licence:
-        raise FormatError("--part: name the robot's licence by --licence, such as MIT")
-    with status(args, f"importing {path}"):
-        robot = robot_source.import_robot(
-            path,
-            xacro_args,
-            root=args.root,
-            root_link=args.root_link,
-            tool=args.tool,
-            srdf=args.srdf,
-            name=args.name,
-            repair=not args.as_is,
-            skip_missing_meshes=args.skip_missing_meshes,
-        )
-    folder = bundle_folder(args.out, robot.name)
-    if path.resolve().is_relative_to(folder.resolve()):
-        raise FormatError(
-            f"{path}: its bundle would replace {folder}, the folder that it is in; "
-            "choose another --name or --out"
-        )
-    part = None
-    if args.part:  # refuses before the bundle is replaced
-        part = part_manifest(robot, folder / URDF, args.part, args.parts or _PARTS, args.licence)
-    data, text, code = write_checked(robot, args)
-    if part is None:
-        return data, text, code
-    write_part(*part)
-    manifest = str(part[0])
-    return {**data, "part": manifest}, f"{text}\n{manifest}", code

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import pkgutil
 from collections.abc import Mapping
 from functools import partial
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 
-from morphgen.errors import FormatError, nearest
 from morphgen.formats import resolve
 from morphgen.formats.data_files import kept_reading
 from morphgen.formats.urdf.read import read_urdf, require_description_file, require_no_arguments
@@ -62,31 +58,3 @@ def is_mjcf(path: Path) -> bool:
         return False
     with path.open("rb") as file:
         return root_tag(file.read(_MAX_HEAD)) == "mujoco"
-
-
-DESCRIPTIONS = "robot_descriptions"  # module of the pip package, and prefix of its robots
-_PATHS = ("MJCF_PATH", "URDF_PATH", "XACRO_PATH")
-"""Names of the paths in a module of ``robot_descriptions``; the first one that exists is taken."""
-
-
-def find_description(text: str) -> tuple[Path, dict[str, str]]:
-    """Return the file that a path or ``robot_descriptions:NAME`` names, and its xacro arguments."""
-    collection, colon, name = text.partition(":")
-    if not colon or collection != DESCRIPTIONS:
-        return Path(text), {}
-    spec = find_spec(DESCRIPTIONS)
-    if spec is None:
-        raise FormatError(f"{text}: pip install {DESCRIPTIONS}, which has its robots")
-    modules = pkgutil.iter_modules(spec.submodule_search_locations)
-    names = [module.name for module in modules if module.name.endswith("_description")]
-    if name not in names:
-        raise FormatError(f"{text}: no such robot{nearest(name, names)}")
-    try:
-        module = import_module(f"{DESCRIPTIONS}.{name}")
-    except Exception as error:  # whatever the package's download raises, such as GitCommandError
-        raise FormatError(f"{text}: cannot be loaded: {error}") from error
-    for key in _PATHS:
-        if path := getattr(module, key, None):
-            args = getattr(module, "XACRO_ARGS", {}) if key == "XACRO_PATH" else {}
-            return Path(path), {name: str(args[name]) for name in args}
-    raise FormatError(f"{text}: the module has none of {', '.join(_PATHS)}")
