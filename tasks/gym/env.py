@@ -8,7 +8,6 @@ precision: all of its formulas are those of the batch, for arrays of NumPy.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from inspect import currentframe
 from typing import Any, cast
 
 import gymnasium as gym
@@ -29,7 +28,6 @@ from morphgen.tasks.gym.vector import (
     NumpyObservation,
     action_space,
     batch_options,
-    episode_limit,
     numpy_observation,
     observation_space,
 )
@@ -215,7 +213,6 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         self._size, self.render_mode = render_arguments(render_mode, size), render_mode
         self._renderer: Renderer | None = None
         options = batch_options("one environment", task, config, options, _OPTIONS)
-        episode_limit(_limit_for_make(), task, options)
         self.task = task
         batch = make_batch(task, [robot], 1, **options)
         self._wrap(batch)
@@ -291,12 +288,3 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
             for name, values in numpy_observation(observation).items()
             if values.dtype == np.float32 and name not in self._hidden
         }
-
-
-def _limit_for_make() -> int | None:
-    """Return the ``max_episode_steps`` that ``gym.make`` was called with, if it was."""
-    # It gives them to a wrapper alone, which would be without effect beyond the task's limit.
-    frame = currentframe()
-    while frame is not None and frame.f_code is not gym.make.__code__:
-        frame = frame.f_back
-    return None if frame is None else frame.f_locals.get("max_episode_steps")

@@ -21,7 +21,7 @@ from morphgen.tasks.actions import BINS
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.observation import Observation
 from morphgen.tasks.registry import KINEMATIC_CHANNELS, TASKS, register_gym_envs
-from morphgen.tasks.scenes.env_specs import GoalConfig, task_configs
+from morphgen.tasks.scenes.env_specs import task_configs
 from morphgen.tasks.scenes.make import BatchOptions, make_batch
 from morphgen.tasks.task import BOUND, TaskConfig
 
@@ -69,19 +69,6 @@ def action_space(kind: str, actions: int) -> spaces.Box | spaces.MultiDiscrete:
     if kind == "continuous":
         return spaces.Box(-1.0, 1.0, (actions,), np.float32)
     return spaces.MultiDiscrete([len(BINS)] * actions)
-
-
-def episode_limit(given: int | None, task: str, options: Mapping[str, Any]) -> int:
-    """Return the ``max_episode_steps`` of ``gym.make``, or else the task's own, which is larger."""
-    limit = GoalConfig(tasks=options.get("configs", ())).task_config(task).max_episode_steps
-    if given is None:
-        return limit
-    if whole_number("max_episode_steps", given, TaskError, 1) > limit:
-        raise TaskError(
-            f"max_episode_steps {given}: episodes end after {limit} control steps; for longer ones "
-            f"pass a config of the task with max_episode_steps={given}"
-        )
-    return given
 
 
 OPTIONS = frozenset(
@@ -270,17 +257,13 @@ def task_vector(
     robot: RobotLike = "ur5-plane",
     robots: Sequence[RobotLike] = (),
     config: TaskConfig | Mapping[str, Any] | None = None,
-    max_episode_steps: int | None = None,
     **options: Any,  # noqa: ANN401
 ) -> TaskVector:
     """Make a vector environment for ``gymnasium.make_vec("morphgen/Reach-v0", num_envs, ...)``."""
     options = batch_options("vector environments", task, config, options, OPTIONS)
     if options.get("seed") is None:
         options["seed"] = int(np.random.default_rng().integers(2**63))
-    limit = episode_limit(max_episode_steps, task, options)
-    batch = make_batch(task, robots or [robot], num_envs, **options)
-    batch.max_episode_steps.clamp_(max=limit)
-    return TaskVector(batch)
+    return TaskVector(make_batch(task, robots or [robot], num_envs, **options))
 
 
 def _infos(step: Step, where: Array) -> dict[str, Any]:
