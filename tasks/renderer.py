@@ -27,8 +27,8 @@ from morphgen.formats.files import require_writable_file
 from morphgen.formats.mjcf.write import to_spec
 from morphgen.formats.picture import gl_context
 from morphgen.model.geometry import Box, Pose, Shape
-from morphgen.model.inertia import bounding_box, box_corners, fit_camera
-from morphgen.model.kinematics import forward_kinematics, movable_positions
+from morphgen.model.inertia import box_corners, fit_camera, robot_corners
+from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Robot
 from morphgen.model.rotation import Vec3
 from morphgen.tasks.batch import TaskBatch
@@ -130,18 +130,6 @@ def _add_marker(spec: mujoco.MjSpec, marker: Marker) -> mujoco.MjsBody:
     return body
 
 
-def _robot_corners(robot: Robot, q: Array) -> list[Array]:
-    """Return corners of the links' bounding boxes in configurations (n, dof), (8 n, 3) each."""
-    T_root_link = forward_kinematics(robot, q)
-    points = []
-    for i, link in enumerate(robot.links):
-        if link.visuals or link.collisions:
-            corners = box_corners(*bounding_box(link.visuals or link.collisions))
-            R, p = T_root_link[:, i, :3, :3], T_root_link[:, i, None, :3, 3]
-            points.append((corners @ R.transpose(0, 2, 1) + p).reshape(-1, 3))
-    return points
-
-
 Frame = NDArray[np.uint8]
 
 
@@ -214,7 +202,7 @@ class Renderer:
                 np.zeros((1, 3)),
                 *_corners_in_world(scene.obstacles),
                 points,
-                *_robot_corners(scene.robot, configurations),
+                robot_corners(scene.robot, configurations).reshape(-1, 3),
             ]
         )
         if scene.ground is not None:

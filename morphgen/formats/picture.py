@@ -15,8 +15,8 @@ from PIL import Image
 from morphgen.errors import MissingDependencyError
 from morphgen.formats.quiet import log_mujoco_warnings
 from morphgen.model.geometry import Pose
-from morphgen.model.inertia import bounding_box, box_corners
-from morphgen.model.kinematics import forward_kinematics, movable_positions
+from morphgen.model.inertia import robot_corners
+from morphgen.model.kinematics import movable_positions
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
 
@@ -80,14 +80,9 @@ def render(robot: Robot, mjcf: Path, size: tuple[int, int] = SIZE) -> Image.Imag
 
 def _framing(robot: Robot, aspect: float) -> tuple[Array, float]:
     """Return centre (3,) and distance [m] of the closest view of the whole robot and its origin."""
-    T_root_link = forward_kinematics(robot, robot.home)
-    points = [np.zeros((1, 3))]
-    for T, link in zip(T_root_link, robot.links, strict=True):
-        if link.visuals or link.collisions:
-            corners = box_corners(*bounding_box(link.visuals or link.collisions))
-            points.append(corners @ T[:3, :3].T + T[:3, 3])
     axes = _CAMERA.matrix[:3, :3]
-    across, ahead, up = (np.concatenate(points) @ axes).T
+    points = np.concatenate([np.zeros((1, 3)), robot_corners(robot, robot.home)])
+    across, ahead, up = (points @ axes).T
     middle = np.array([(v.min() + v.max()) / 2 for v in (across, ahead, up)])
     tangent = _MARGIN * math.tan(math.radians(_FOV / 2))
     distances = np.maximum(

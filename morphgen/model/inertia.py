@@ -27,8 +27,9 @@ from morphgen.model.geometry import (
     half_extents,
     volume,
 )
+from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.mesh import Triangles, convex_hull, load_mesh, mesh_key, mesh_triangles
-from morphgen.model.robot import Inertial, Link
+from morphgen.model.robot import Inertial, Link, Robot
 from morphgen.model.rotation import vec3
 from morphgen.typing import Array
 
@@ -181,6 +182,20 @@ def box_corners(low: ArrayLike, high: ArrayLike) -> Array:
     """Return the corners (8, 3) of an axis-aligned box, from the lowest and the highest [m]."""
     sides = np.stack([np.asarray(low), np.asarray(high)], axis=1)
     return np.array(np.meshgrid(*sides)).reshape(3, -1).T
+
+
+def robot_corners(robot: Robot, q: ArrayLike) -> Array:
+    """Return corners of boxes around links, as they look, in the root frame: (..., n, 3) [m].
+
+    The joint positions q have the shape (..., dof) [rad or m].
+    """
+    T_root_link = forward_kinematics(robot, q)
+    corners = [np.zeros((*T_root_link.shape[:-3], 0, 3))]
+    for i, link in enumerate(robot.links):
+        if shapes := link.visuals or link.collisions:
+            R, p = T_root_link[..., i, :3, :3], T_root_link[..., i, None, :3, 3]
+            corners.append(box_corners(*bounding_box(shapes)) @ R.swapaxes(-1, -2) + p)
+    return np.concatenate(corners, axis=-2)
 
 
 def fit_camera(points: Array, tangents: Array) -> Array:

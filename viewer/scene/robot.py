@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from morphgen.model.geometry import Box, Pose, Shape
-from morphgen.model.inertia import bounding_box, box_corners
+from morphgen.model.inertia import robot_corners
 from morphgen.model.kinematics import forward_kinematics, frame_positions, random_configurations
 from morphgen.model.robot import Link, Robot
 from morphgen.model.rotation import Vec3
@@ -181,14 +181,9 @@ def add_robot(
 
 def robot_bounds(robot: Robot, q: ArrayLike | None = None) -> tuple[Array, Array]:
     """Return the lowest and highest corner of a robot in its root frame, by default at home [m]."""
-    T_root_link = forward_kinematics(robot, robot.home if q is None else q)
-    points = [np.zeros((1, 3))]
-    for T, link in zip(T_root_link, robot.links, strict=True):
-        if shapes := link.visuals or link.collisions:
-            corners = box_corners(*bounding_box(shapes))
-            points.append(corners @ T[:3, :3].T + T[:3, 3])
-    stacked = np.concatenate(points)
-    return stacked.min(axis=0), stacked.max(axis=0)
+    corners = robot_corners(robot, robot.home if q is None else q)
+    points = np.concatenate([np.zeros((1, 3)), corners])
+    return points.min(axis=0), points.max(axis=0)
 
 
 def robot_extent(robot: Robot) -> float:
