@@ -289,19 +289,19 @@ def test_parts_are_not_kept_where_ros_finds_packages(kept, tmp_path, monkeypatch
 
 
 def test_a_part_whose_mesh_is_gone_is_read_again(kept, monkeypatch):
-    from morphgen.formats import description
+    from morphgen.formats import bundle
 
     manifest = default_library().manifest("px100")
     part_module.load_part(manifest)
     forget()
-    kept_robot = description.kept_reading
+    kept_robot = bundle.kept_reading
 
     def moved(*arguments):
         robot = kept_robot(*arguments)
         shape = Shape(Mesh(Path("/gone.stl")))
         return replace(robot, links=tuple(replace(x, visuals=(shape,)) for x in robot.links))
 
-    monkeypatch.setattr(description, "kept_reading", moved)
+    monkeypatch.setattr(bundle, "kept_reading", moved)
     part = part_module.load_part(manifest)
     shapes = [shape.geometry for link in part.fragment.links for shape in link.visuals]
     paths = {shape.path for shape in shapes if isinstance(shape, Mesh)}

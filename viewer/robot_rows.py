@@ -12,9 +12,8 @@ from typing import Any
 from morphgen.benchmark.split_folder import SPLIT_FILE
 from morphgen.errors import FormatError
 from morphgen.files import file_stamp
-from morphgen.formats.bundle import CARD, part_licences
+from morphgen.formats.bundle import CARD, SUFFIXES, is_mjcf, part_licences
 from morphgen.formats.data_files import read_json
-from morphgen.formats.description import SUFFIXES, is_mjcf
 from morphgen.grammar.catalogue import known_facts, stored_facts
 from morphgen.grammar.library import Library
 from morphgen.grammar.robot_source import is_robot_folder

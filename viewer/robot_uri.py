@@ -29,8 +29,7 @@ from platformdirs import user_cache_path
 from morphgen.benchmark.split_folder import SPLIT_FILE
 from morphgen.errors import MorphgenError, nearest
 from morphgen.files import file_stamp
-from morphgen.formats.bundle import CARD, MJCF, URDF, split_colours
-from morphgen.formats.description import is_mjcf
+from morphgen.formats.bundle import CARD, MJCF, URDF, is_mjcf, split_colours
 from morphgen.formats.mjcf.document import read_document
 from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.urdf.write import urdf_text

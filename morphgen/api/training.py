@@ -14,7 +14,7 @@ from typing import Any
 from morphgen.benchmark.split_folder import read_split_or_folder
 from morphgen.encoding.tokens import default_max_links, require_max_links
 from morphgen.errors import BenchmarkError, TaskError, require_types
-from morphgen.formats.description import SUFFIXES
+from morphgen.formats.bundle import SUFFIXES
 from morphgen.grammar.library import LibraryFolders, library_folders
 from morphgen.grammar.robot_source import is_robot_folder, is_set_folder
 from morphgen.grammar.sampling import GRAMMAR

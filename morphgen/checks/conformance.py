@@ -30,8 +30,7 @@ from morphgen.checks.readers import (
     loader_copy,
 )
 from morphgen.errors import FormatError, MorphgenError, one_line, whole_number
-from morphgen.formats.bundle import MJCF, URDF, read_bundle
-from morphgen.formats.description import read_description
+from morphgen.formats.bundle import MJCF, URDF, read_bundle, read_description
 from morphgen.formats.quiet import MujocoWarnings, quiet
 from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.urdf.write import BOUND_INERTIA, BOUND_MASS

@@ -21,8 +21,7 @@ import numpy as np
 from lxml import etree
 
 from morphgen.errors import FormatError, one_line
-from morphgen.formats.bundle import MJCF, URDF, mesh_file
-from morphgen.formats.description import is_mjcf
+from morphgen.formats.bundle import MJCF, URDF, is_mjcf, mesh_file
 from morphgen.formats.mjcf.document import read_document, remove_element
 from morphgen.formats.quiet import quiet
 from morphgen.formats.resolve import PackageFinder, default_finder, resolve_uri

@@ -1,4 +1,4 @@
-"""Read and write bundles: a robot as a folder that every loader can read."""
+"""Read and write bundles, robots as folders that every loader can read, and read descriptions."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,8 @@ from msgspec import field
 
 from morphgen.errors import FormatError, one_line
 from morphgen.files import file_sha256
-from morphgen.formats.data_files import read_json
-from morphgen.formats.description import read_description
+from morphgen.formats import resolve
+from morphgen.formats.data_files import kept_reading, read_json
 from morphgen.formats.files import (
     folder_hashes,
     replacing_folder,
@@ -26,14 +27,18 @@ from morphgen.formats.files import (
 from morphgen.formats.fits import FITS, fits_of_copies, fits_text, read_fits
 from morphgen.formats.mjcf.write import mjcf_text
 from morphgen.formats.records import FiniteNumber, Record, read_record
-from morphgen.formats.resolve import default_finder
 from morphgen.formats.rounding import round_number
-from morphgen.formats.urdf.read import read_urdf, with_frames
+from morphgen.formats.urdf.read import (
+    read_urdf,
+    require_description_file,
+    require_no_arguments,
+    with_frames,
+)
 from morphgen.formats.urdf.write import urdf_text
-from morphgen.formats.xml import found
+from morphgen.formats.xml import found, root_tag
 from morphgen.model.dynamics import actuation
 from morphgen.model.findings import Finding
-from morphgen.model.geometry import Mesh, Shape, StoredFits
+from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere, StoredFits
 from morphgen.model.kinematics import arm_reach
 from morphgen.model.mesh import (
     MAX_STL_FACES,
@@ -42,7 +47,7 @@ from morphgen.model.mesh import (
     mesh_parts,
     require_bounded_meshes,
 )
-from morphgen.model.robot import Robot
+from morphgen.model.robot import Frame, Inertial, Joint, Link, Mimic, Robot
 
 URDF = "robot.urdf"
 MJCF = "robot.xml"
@@ -110,7 +115,7 @@ def write_bundle(
 def read_bundle(folder: Path, *, root: Path | None = None) -> Robot:
     """Read a robot from its bundle."""
     card = read_card(folder)
-    robot = read_urdf(folder / URDF, finder=default_finder(root=root), keep_order=True)
+    robot = read_urdf(folder / URDF, finder=resolve.default_finder(root=root), keep_order=True)
     return replace(apply_card(robot, card, str(folder / CARD)), fits=fits_in(folder))
 
 
@@ -175,7 +180,7 @@ def read_robot(path: Path, *, root: Path | None = None, skip_missing_meshes: boo
     if path.name in (URDF, MJCF) and (path.parent / CARD).is_file():
         return read_bundle(path.parent, root=root)
     is_xacro = path.suffix == XACRO
-    finder = default_finder(root=root, skip_missing=skip_missing_meshes)
+    finder = resolve.default_finder(root=root, skip_missing=skip_missing_meshes)
     robot = read_description(path, finder=finder, written_frames=not is_xacro)
     return replace(robot, fits=fits_in(path.parent))
 
@@ -362,3 +367,52 @@ def apply_card(robot: Robot, card: Mapping[str, Any], origin: str) -> Robot:
         raise FormatError(f"{origin}: home: missing joint {error}") from error
     provenance = {key: card[key] for key in _PROVENANCE if key in card}
     return replace(robot, home=home, ignore_pairs=record.ignore_pairs, provenance=provenance)
+
+
+_KEPT = (
+    *(Robot, Link, Joint, Frame, Inertial, Mimic, Shape, Pose, Finding),
+    *(Box, Capsule, Cylinder, Mesh, Sphere),
+)
+"""Types of what is kept of a robot."""
+SUFFIXES = (".urdf", ".xacro", ".xml")  # file name suffixes of robot descriptions
+_MAX_HEAD = 2**20  # number of bytes within which the root element of an MJCF begins
+
+
+def read_description(
+    path: Path,
+    args: Mapping[str, str] | None = None,
+    finder: resolve.PackageFinder | None = None,
+    *,
+    root_link: str | None = None,
+    written_frames: bool = False,
+) -> Robot:
+    """Read a xacro (by its suffix), an MJCF (by its root element ``<mujoco>``), or a URDF."""
+    require_description_file(path)
+    if is_mjcf(path):
+        from morphgen.formats.mjcf.read import read_mjcf  # takes a second to load
+
+        require_no_arguments(path, args)
+        return read_mjcf(path, finder, root_body=root_link)
+    return read_urdf(path, args, finder, written_frames=written_frames)
+
+
+def read_installed(package: str, file: str, args: Mapping[str, str]) -> Robot:
+    """Read a description of an installed data package, kept in the user's cache."""
+    path, finder = resolve.distribution_file(package, file), resolve.default_finder()
+    read = partial(read_description, path, args, finder)
+    if not (resolve.is_installed(path) and resolve.finds_installed_only(finder)):
+        return read()
+    key = (path, finder.roots, dict(args))
+    robot = kept_reading("robot", key, read, _KEPT)
+    return robot if all(mesh.path.is_file() for mesh in robot.meshes) else read()
+
+
+def is_mjcf(path: Path) -> bool:
+    """Return whether a file is an MJCF: its root element is ``<mujoco>``.
+
+    A file with the suffix ``.xacro`` is none; it is not opened.
+    """
+    if path.suffix == ".xacro" or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return root_tag(file.read(_MAX_HEAD)) == "mujoco"

@@ -22,7 +22,7 @@ from morphgen.errors import (
     nearest,
 )
 from morphgen.files import file_stamp, write_atomic
-from morphgen.formats.description import is_mjcf, read_description, read_installed
+from morphgen.formats.bundle import is_mjcf, read_description, read_installed
 from morphgen.formats.resolve import PackageFinder
 from morphgen.formats.rounding import format_number
 from morphgen.formats.urdf.read import robot_from_xml

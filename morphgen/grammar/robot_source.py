@@ -12,9 +12,8 @@ from morphgen.checks import fix, record_repairs
 from morphgen.checks.self_collision import survey_collisions
 from morphgen.checks.srdf import read_srdf, with_disabled_pairs
 from morphgen.errors import CompositionError, FormatError, nearest
-from morphgen.formats.bundle import CARD, XACRO, fits_in, read_robot
+from morphgen.formats.bundle import CARD, SUFFIXES, XACRO, fits_in, read_description, read_robot
 from morphgen.formats.data_files import read_text
-from morphgen.formats.description import SUFFIXES, read_description
 from morphgen.formats.resolve import default_finder
 from morphgen.grammar.compose import compose
 from morphgen.grammar.grammar_file import SUFFIX as GRAMMAR_SUFFIX

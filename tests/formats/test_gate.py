@@ -25,8 +25,14 @@ from morphgen.checks.conformance import conformance
 from morphgen.checks.readers import loader_copy
 from morphgen.cli import main, progress
 from morphgen.errors import FormatError, MorphgenError
-from morphgen.formats.bundle import MJCF, URDF, read_robot, split_colours, write_bundle
-from morphgen.formats.description import read_description
+from morphgen.formats.bundle import (
+    MJCF,
+    URDF,
+    read_description,
+    read_robot,
+    split_colours,
+    write_bundle,
+)
 from morphgen.model import mesh as mesh_module
 from morphgen.model.mesh import load_mesh
 from morphgen.model.robot import Robot

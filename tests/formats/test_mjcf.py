@@ -14,8 +14,7 @@ from helpers.mjcf import TWO_JOINTS, inertia_in_mujoco, read, refusal, write
 from helpers.parts import write_part
 from helpers.robots import arm, composed, rod
 from morphgen.errors import FormatError
-from morphgen.formats.bundle import read_bundle, read_robot, write_bundle
-from morphgen.formats.description import is_mjcf, read_description
+from morphgen.formats.bundle import is_mjcf, read_bundle, read_description, read_robot, write_bundle
 from morphgen.formats.mjcf.read import read_mjcf
 from morphgen.formats.mjcf.write import FLAT_THICKNESS, mjcf_text, to_spec
 from morphgen.formats.resolve import default_finder
