@@ -76,7 +76,11 @@ def robot_srdf_text(robot: Robot, samples: int = MATRIX_SAMPLES) -> str:
     robot with several limbs are named after them, such as ``left_arm``. Links that collide as
     spheres alone have them as a ``link_sphere_approximation``.
     """
-    require_tool(robot)
+    if robot.tool is None:
+        raise FormatError(
+            f"robot {robot.name!r} has no frame {TOOL!r}, where its arm ends; import it with a "
+            "tool (morphgen import FILE --tool LINK)"
+        )
     reasons = collision_matrix(robot, samples)
     root = etree.Element("robot", name=robot.name)
     _write_limbs(root, robot, [*_limbs(robot)])
@@ -175,15 +179,6 @@ def _gripper_links(robot: Robot, tool: Frame) -> list[str]:
     if links[0] == moving[-1] + 1:
         links = links[1:]
     return [robot.links[i].name for i in links]
-
-
-def require_tool(robot: Robot) -> None:
-    """Require that a robot has the frame ``tool``, which an SRDF and planners need."""
-    if robot.tool is None:
-        raise FormatError(
-            f"robot {robot.name!r} has no frame {TOOL!r}, where its arm ends; import it with a "
-            "tool (morphgen import FILE --tool LINK)"
-        )
 
 
 MAX_SRDF_BYTES = 16 * 2**20  # size of the largest SRDF that is read [bytes]

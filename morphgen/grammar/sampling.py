@@ -20,7 +20,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ import msgspec
 import numpy as np
 
 from morphgen.checks import check
-from morphgen.errors import FormatError, MorphgenError, shortened
+from morphgen.errors import FormatError, MorphgenError
 from morphgen.files import write_atomic
 from morphgen.formats.bundle import URDF, write_bundle
 from morphgen.formats.data_files import read_json, read_text
@@ -93,7 +92,7 @@ def sample_robot(
     conditions = [
         clause for condition in (*grammar.wheres, *where) for clause in clauses(condition)
     ]
-    name = name or robot_name(grammar, index)
+    name = name or f"{grammar.name}-{index:06d}"
     rejected: Counter[str] = Counter()
     for _ in range(MAX_ATTEMPTS):
         chooser = RandomChooser(rng)
@@ -111,11 +110,6 @@ def sample_robot(
         f"robot {index} of {grammar.name!r}: 0 of {MAX_ATTEMPTS} draws were accepted; "
         f"{times} failed at: {reason}"
     )
-
-
-def robot_name(grammar: Grammar, index: int) -> str:
-    """Return the default name of robot number ``index`` of a grammar."""
-    return f"{grammar.name}-{index:06d}"
 
 
 def _build_if_valid(
@@ -336,15 +330,10 @@ def write_light(robot: Robot, folder: Path) -> None:
 
 def _require_same_grammar(config: SetConfig) -> None:
     """Require the text of the grammar that the set was begun with."""
-    before = read_text(config.folder / GRAMMAR, MAX_TEXT)
-    if before != config.grammar_text:
-        lines = (text.split("\n") for text in (before, config.grammar_text))
-        pairs = zip_longest(*lines, fillvalue="(end)")
-        line, (old, new) = next((i, pair) for i, pair in enumerate(pairs, 1) if len({*pair}) > 1)
+    if read_text(config.folder / GRAMMAR, MAX_TEXT) != config.grammar_text:
         raise FormatError(
-            f"{config.folder} holds a set of another grammar {config.grammar_name!r}: line {line} "
-            f"of its {GRAMMAR} is {shortened(old)!r}, not {shortened(new)!r}; name another folder, "
-            "or delete this one"
+            f"{config.folder} holds a set of another grammar {config.grammar_name!r}, that of its "
+            f"{GRAMMAR}; name another folder, or delete this one"
         )
 
 
