@@ -13,16 +13,14 @@ from morphgen.model.inertia import bounding_box
 from morphgen.tasks.articulated.starts import ArticulatedStartSet
 from morphgen.tasks.configs import ArticulatedConfig
 from morphgen.tasks.observation import box_tokens
-from morphgen.tasks.push.envs import GAP, curriculum_part, push_terms
+from morphgen.tasks.push.envs import GAP, curriculum_part, moving_result
 from morphgen.tasks.random_numbers import EpisodeRandom, Stream
 from morphgen.tasks.rows import (
     GoalChoices,
-    choose,
     namespace_of,
     padded_rows,
     positive_part,
     rotated,
-    row_norms,
     row_sums,
 )
 from morphgen.tasks.sim.articulated import ArticulatedObject, ObjectJoints
@@ -70,19 +68,11 @@ class ArticulatedFormulas(StepFormulas[A]):
 
     def evaluate(self, state: TaskState[A]) -> StepResult[A]:
         """Compare the motions of the joints with the wanted ones."""
-        config, pose = self._config, state.object_pose
+        pose = state.object_pose
         moved = self.sign * (self.position(pose) - self.start)
         to_go = positive_part(self.travel - moved) * self._lever
-        success = (moved > self.travel) & ~state.diverged
         surface = pose[..., :3] + rotated(pose[..., 3:], self.surface)
-        approach = row_norms(state.tool - surface)
-        return StepResult(
-            success=success,
-            terminated=success & ~state.diverged,
-            distance=to_go,
-            score=choose(success, 1.0),
-            terms=push_terms(config, to_go, approach, state.limit_violation, success),
-        )
+        return moving_result(self._config, state, to_go, moved > self.travel, surface)
 
     def observe(self, object_pose: A) -> dict[str, A]:
         """Return boxes around contact shapes and bases, and the joints."""

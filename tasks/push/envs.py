@@ -45,17 +45,9 @@ class PushFormulas(StepFormulas[A]):
 
     def evaluate(self, state: TaskState[A]) -> StepResult[A]:
         """Compare the blocks with their lines."""
-        y, config = state.object_pose[..., 1], self._config
+        y = state.object_pose[..., 1]
         to_go = positive_part(self._line - y)
-        success = (y > self._line) & ~state.diverged
-        approach = row_norms(state.tool - state.object_pose[..., :3])
-        return StepResult(
-            success=success,
-            terminated=success & ~state.diverged,
-            distance=to_go,
-            score=choose(success, 1.0),
-            terms=push_terms(config, to_go, approach, state.limit_violation, success),
-        )
+        return moving_result(self._config, state, to_go, y > self._line, state.object_pose[..., :3])
 
     def observe(self, object_pose: A) -> dict[str, A]:
         """Return the blocks and their lines."""
@@ -127,23 +119,27 @@ class PushEnvs(TaskEnvs):
         self.line.copy_(state["line"])
 
 
-def push_terms(
-    config: ObjectTaskConfig,
-    to_go: A,
-    approach: A,
-    limit_violation: A,
-    success: A,
-) -> dict[str, A]:
-    """Return the reward terms of moving an object (paper, of push), shape (k,) each.
+def moving_result(
+    config: ObjectTaskConfig, state: TaskState[A], to_go: A, has_arrived: A, point: A
+) -> StepResult[A]:
+    """Return the result of a step of moving an object, with the reward terms of push (paper).
 
-    They depend on the distances of the object from its goal and from the tool [m].
+    They depend on the distances of the object from its goal, (k,), and of the tool from a point of
+    the object, (k, 3) [m].
     """
-    return {
-        "joint_limits": -config.joint_limit_weight * limit_violation,
-        "distance": -config.distance_weight * to_go,
-        "approach": -config.approach_weight * approach,
-        "success": choose(success, config.success_weight),
-    }
+    success = has_arrived & ~state.diverged
+    return StepResult(
+        success=success,
+        terminated=success & ~state.diverged,
+        distance=to_go,
+        score=choose(success, 1.0),
+        terms={
+            "joint_limits": -config.joint_limit_weight * state.limit_violation,
+            "distance": -config.distance_weight * to_go,
+            "approach": -config.approach_weight * row_norms(state.tool - point),
+            "success": choose(success, config.success_weight),
+        },
+    )
 
 
 def curriculum_part(config: ObjectTaskConfig, progress: float) -> float:

@@ -36,7 +36,7 @@ from morphgen.tasks.actions import ActionDecoder, JointMotion
 from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.gym.vector import TaskVector
 from morphgen.tasks.observation import LinkTokens
-from morphgen.tasks.push.envs import PushFormulas, curriculum_part, push_terms
+from morphgen.tasks.push.envs import PushFormulas, curriculum_part, moving_result
 from morphgen.tasks.reach.envs import ReachEnvs, ReachFormulas
 from morphgen.tasks.reach.task import Reach
 from morphgen.tasks.registry import TASKS
@@ -133,8 +133,10 @@ def test_reach_reward_terms():
 
 
 def test_push_reward_terms():
-    to_go, approach = torch.tensor([0.0, 0.3]), torch.tensor([0.1, 0.2])
-    terms = push_terms(PushConfig(), to_go, approach, torch.zeros(2), torch.tensor([True, False]))
+    tool, zero = torch.tensor([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0]]), torch.zeros(2)
+    state = TaskState(tool, torch.zeros(2, 7), zero, zero, diverged=zero > 0)
+    to_go, arrived = torch.tensor([0.0, 0.3]), torch.tensor([True, False])
+    terms = moving_result(PushConfig(), state, to_go, arrived, torch.zeros(2, 3)).terms
     assert terms["success"].tolist() == [10.0, 0.0]
     assert terms["distance"].tolist() == pytest.approx([0.0, -0.3])
     assert terms["approach"].tolist() == pytest.approx([-0.05, -0.1])
