@@ -54,8 +54,7 @@ def print_grammar(args: argparse.Namespace) -> None:
     opt.print_result(args, text, lambda: text.removesuffix("\n"))
 
 
-MAX_LISTED = 3
-"""Largest number of reasons, and of robots with the body of another one, that are printed."""
+MAX_LISTED = 3  # largest number of reasons that are printed
 
 
 def sample(args: argparse.Namespace) -> None:
@@ -84,11 +83,6 @@ def sample(args: argparse.Namespace) -> None:
             lines.append(f"  {times} of {draws} draws rejected: {reason}")
         if others := sum(times for _, times in rejected.most_common()[MAX_LISTED:]):
             lines.append(f"  {others} rejected for other reasons; --json has all")
-        if twins := [f"{name} as {same}" for name, same in report.duplicates]:
-            number = f"{len(twins)} robot{' has' if len(twins) == 1 else 's have'}"
-            more = ", ..." if len(twins) > MAX_LISTED else ""
-            listed = ", ".join(twins[:MAX_LISTED])
-            lines.append(f"  {number} the same body as an earlier one: {listed}{more}")
         return "\n".join(lines)
 
     opt.print_result(args, {"folder": str(folder), **asdict(report)}, summary)

@@ -179,8 +179,6 @@ class SetReport:
     made: int  # robots made by this run
     kept: int  # robots that existed before
     rejected: dict[str, int]  # number of rejected draws of the whole set, by reason
-    duplicates: list[tuple[str, str]]
-    """Robots with the derivation of an earlier one: (name, name of the earlier one)."""
 
 
 def make_set(config: SetConfig, n: int, jobs: int = 1) -> SetReport:
@@ -360,13 +358,8 @@ def _finished(config: SetConfig) -> dict[int, bytes]:
 def _write_index(config: SetConfig, made: int, kept: int) -> SetReport:
     """Write all records in order of their indices, and summarize them."""
     rejected: Counter[str] = Counter()
-    first_names: dict[str, str] = {}  # name of the first robot of each derivation, by hash
-    duplicates = []
     lines = [line for _, line in sorted(_finished(config).items())]
     write_atomic(config.folder / INDEX, b"".join(lines))
-    for record in map(json.loads, lines):
-        rejected.update(record["rejected"])
-        first = first_names.setdefault(record["hash"], record["name"])
-        if first != record["name"]:
-            duplicates.append((record["name"], first))
-    return SetReport(made, kept, dict(rejected), duplicates)
+    for line in lines:
+        rejected.update(json.loads(line)["rejected"])
+    return SetReport(made, kept, dict(rejected))

@@ -48,9 +48,7 @@ def test_sample_creates_a_set_and_prints_its_size(run, tmp_path):
 
 def test_sample_reads_a_grammar_file_and_prints_its_report_as_json(ok, mine):
     report = json.loads(ok("sample", mine, "-n", 2, "--light", "--json", "--where", "mass < 900"))
-    same = [["mine-000001", "mine-000000"]]  # both are the cube
-    counts = {"made": 2, "kept": 0, "rejected": {}, "duplicates": same}
-    assert report == {"folder": "robots/mine", **counts}
+    assert report == {"folder": "robots/mine", "made": 2, "kept": 0, "rejected": {}}
     assert [record["name"] for record in records("robots/mine")] == ["mine-000000", "mine-000001"]
 
 
@@ -74,17 +72,6 @@ def test_sample_writes_pictures_unless_no_picture_is_given(run):
 def test_sample_prints_the_number_of_rejected_draws(ok):
     out = ok("sample", "cubes", "-n", 5, "--light", "--where", "mass < 0.5")
     assert re.fullmatch(r"  (\d+) of \d+ draws rejected: where \(mass < 0.5\)", out.splitlines()[1])
-
-
-def test_sample_reports_duplicate_robots(ok):
-    Path("one.grammar").write_text("robot -> cubes\n")
-    begin, twin = "the same body as an earlier one:", "one-000001 as one-000000"
-    out = ok("sample", "one.grammar", "-n", 2, "--light")
-    assert out.splitlines()[1] == f"  1 robot has {begin} {twin}"
-    out = ok("sample", "one.grammar", "-n", 6, "--light")
-    (line,) = out.splitlines()[1:]
-    assert line.startswith(f"  5 robots have {begin} {twin}, one-000002 as ")
-    assert line.endswith("one-000003 as one-000000, ...")
 
 
 def test_grammar_list_names_the_categories(run):
