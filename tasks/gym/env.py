@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from morphgen.errors import TaskError, nearest, whole_number
+from morphgen.errors import TaskError, whole_number
 from morphgen.grammar.robot_source import RobotLike
 from morphgen.model.kinematics import FramePosition, frame_pose
 from morphgen.tasks.actions import ActionDecoder, JointMotion
@@ -150,9 +150,8 @@ def _info(result: StepResult[Any], diverged: bool) -> dict[str, Any]:
 
 def render_arguments(render_mode: str | None, size: tuple[int, int]) -> tuple[int, int]:
     """Return a valid size of pictures [pixels]."""
-    if render_mode is not None and render_mode not in _RENDER_MODES:
-        hint = nearest(render_mode, _RENDER_MODES)
-        raise TaskError(f"unknown render mode {render_mode!r}{hint}")
+    if render_mode not in (None, "rgb_array"):
+        raise TaskError(f"unknown render mode {render_mode!r}; expected rgb_array")
     try:
         width, height = (whole_number("size", pixels, TaskError, 1) for pixels in size)
     except (TypeError, ValueError) as error:
@@ -160,7 +159,6 @@ def render_arguments(render_mode: str | None, size: tuple[int, int]) -> tuple[in
     return width, height
 
 
-_RENDER_MODES = ("rgb_array",)
 _OPTIONS = OPTIONS - {"workers", "device", "seed", "first", "configs"}
 
 
@@ -192,7 +190,7 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
-        "render_modes": list(_RENDER_MODES),
+        "render_modes": ["rgb_array"],
         "render_fps": round(1 / CONTROL_PERIOD),
     }
 

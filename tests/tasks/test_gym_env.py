@@ -257,7 +257,7 @@ def test_options_of_reset_are_refused():
     ("call", "message"),
     [
         (lambda: task_vector(1, task="reach", robto="x"), "'robto'; did you mean 'robot"),
-        (lambda: make(render_mode="rgb"), "did you mean 'rgb_array'"),
+        (lambda: make(render_mode="rgb"), "'rgb'; expected rgb_array"),
         (lambda: make(size=4), r"size 4: expected width and height \[pixels\]"),
         (lambda: make(observe={"velocity": True}), "'velocity': True}: expected an ObservationCo"),
         (lambda: make(contacts={"scene": False}), "contacts {'scene': False}: expected Contacts"),
