@@ -7,14 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
-from typing import Any, TypeAlias
+from functools import partial
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from morphgen.benchmark import read_text
 from morphgen.benchmark.hold_out import has_hold_out_rules, hold_out_findings
 from morphgen.benchmark.regimes import found, regime_findings
 from morphgen.encoding.robot_hash import robot_hash
@@ -215,19 +212,17 @@ def _compare(known: Sequence[Features | None], compared: NDArray[np.bool_], inde
 DIGITS = 4  # decimals of the statistics
 COUNTED = ("links", "movable", "movable_to_tool")
 MEASURED = ("mass", "reach")
-COSINE = "cosine"
 
 
 def statistics(split: Split, library: Library, *, jobs: int = 1) -> dict[str, object]:
-    """Compute the statistics that the file of a split contains; see ``summarize_survey``."""
-    return summarize_survey(survey_split(split, library, jobs=jobs))
+    """Compute sizes of the robots of a split, and the similarity of test and train robots.
 
-
-def summarize_survey(survey: SplitSurvey) -> dict[str, object]:
-    """Return the statistics of a surveyed split; ``morphgen.api.splits.statistics`` says which."""
+    Files of splits contain them.
+    """
+    survey = survey_split(split, library, jobs=jobs)
     return {
         **{side: _side(survey, side) for side in SIDES},
-        COSINE: mean_and_range(survey.by_measure(COSINE).ravel().tolist()),
+        "cosine": mean_and_range(survey.by_measure("cosine").ravel().tolist()),
     }
 
 
@@ -250,25 +245,6 @@ def _side(survey: SplitSurvey, side: Side) -> dict[str, object]:
         **{key: round(float(np.mean(values[key])), DIGITS) for key in COUNTED},
         **{key: mean_and_range(values[key]) for key in MEASURED},
     }
-
-
-PAPER_TABLE = "AnyBody (arXiv 2505.14986), table 'Statistics about benchmark tasks'"
-
-
-PaperRow: TypeAlias = Mapping[str, Any]
-"""A row of the paper's table: means over the train robots, under the keys of ``paper.yaml``."""
-
-
-def paper_row(split: str) -> PaperRow | None:
-    """Return the paper's row for a scenario such as ``extrapolation/arms/reach``, if it has one."""
-    return paper_rows().get("/".join(split.split("/")[:2]))
-
-
-@cache
-def paper_rows() -> dict[str, PaperRow]:
-    """Return the paper's rows by set of robots, which is a scenario's name without its task."""
-    rows: dict[str, PaperRow] = yaml.safe_load(read_text("paper.yaml"))
-    return rows
 
 
 @dataclass(frozen=True)

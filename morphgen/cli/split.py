@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import itertools
 import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -15,7 +14,7 @@ from morphgen.api.splits import DEFAULT_TRAIN, NewSplit
 from morphgen.api.splits import goals as sample_goals
 from morphgen.api.splits import split as open_split
 from morphgen.benchmark import release as releases
-from morphgen.benchmark import split_folder, survey
+from morphgen.benchmark import split_folder
 from morphgen.benchmark.scores import results as scores
 from morphgen.benchmark.scores.submission import (
     DEFAULT_EPISODES,
@@ -28,7 +27,7 @@ from morphgen.benchmark.scores.submission import (
     read_submissions,
     require_same_random,
 )
-from morphgen.benchmark.survey import Audit, paper_row, statistics
+from morphgen.benchmark.survey import Audit, statistics
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, status
 from morphgen.encoding.similarity import MEASURES
@@ -152,71 +151,35 @@ def verify(args: argparse.Namespace) -> int:
 
 
 def stats(args: argparse.Namespace) -> None:
-    """Print a table with a row per set of robots."""
+    """Print a table with a row per set of robots, which the splits of a folder may share."""
     library = opt.library_of(args)
-    groups = _by_robots([read_split(name) for name in args.splits or split_names()])
-    statistics_by_title: dict[str, dict[str, Any]] = {}
-    for title, splits in groups.items():
+    groups: dict[object, list[Split]] = {}
+    for split in map(read_split, args.splits or split_names()):
+        # The robots are compared in their order.
+        hashes = [tuple(member.robot_hash for member in split.side(side)) for side in SIDES]
+        groups.setdefault((split.name.rpartition("/")[0], *hashes), []).append(split)
+    data: list[dict[str, Any]] = []
+    for splits in groups.values():
+        names = [split.name for split in splits]
+        title = names[0].rpartition("/")[0] if names[1:] else names[0]
         with bar(args, title):
-            statistics_by_title[title] = statistics(splits[0], library, jobs=args.jobs)
-    data = [
-        {
-            "robots": title,
-            "splits": [split.name for split in splits],
-            "ours": statistics_by_title[title],
-            "paper": paper_row(title),
-        }
-        for title, splits in groups.items()
-    ]
+            found = statistics(splits[0], library, jobs=args.jobs)
+        data.append({"robots": title or names[0], "splits": names, "statistics": found})
 
     def text() -> str:
-        rows = [
-            _stats_row(title, ours, paper_row(title)) for title, ours in statistics_by_title.items()
-        ]
-        style = "github" if args.markdown else "simple"
-        lines = [
-            table([list(row.values()) for row in rows], list(rows[0]), style=style),
-            "",
-            "links, joints, mass: mean over the train robots; cosine: of test and train robots",
-            f"in parentheses: {survey.PAPER_TABLE}",
-        ]
-        return "\n".join(lines)
+        rows = [_stats_row(each["robots"], each["statistics"]) for each in data]
+        means = "links, joints, mass: mean over the train robots; cosine: of test and train robots"
+        return f"{table([list(row.values()) for row in rows], list(rows[0]))}\n\n{means}"
 
-    opt.print_result(args, {"rows": data, "paper": survey.PAPER_TABLE}, text)
+    opt.print_result(args, {"rows": data}, text)
 
 
-def _by_robots(splits: Sequence[Split]) -> dict[str, list[Split]]:
-    """Return splits of one folder with the same robots, by what their names have in common."""
-    groups: dict[tuple[str, tuple[tuple[str, ...], ...]], list[Split]] = {}
-    for split in splits:
-        # The robots are compared in their order.
-        hashes = tuple(tuple(m.robot_hash for m in split.side(side)) for side in SIDES)
-        groups.setdefault((split.name.rpartition("/")[0], hashes), []).append(split)
-    return {_common_prefix([split.name for split in group]): group for group in groups.values()}
-
-
-def _common_prefix(names: Sequence[str]) -> str:
-    """Return the path segments that all names begin with, or the first name if there are none."""
-    columns = zip(*(name.split("/") for name in names), strict=False)
-    same = list(itertools.takewhile(lambda column: len(set(column)) == 1, columns))
-    return "/".join(column[0] for column in same) or names[0]
-
-
-def _stats_row(
-    title: str, statistics: Mapping[str, Any], paper_row: survey.PaperRow | None
-) -> dict[str, str]:
+def _stats_row(title: str, statistics: Mapping[str, Any]) -> dict[str, str]:
     train, cosine = statistics["train"], statistics["cosine"]
-
-    def with_paper(value: str, key: str) -> str:
-        if paper_row is None:
-            return value
-        paper = paper_row[key]
-        return f"{value} ({'-' if paper is None else f'{paper:g}'})"
-
     row = {"robots": title, "train": train["robots"], "test": statistics["test"]["robots"]}
     for key in ("links", "movable", "movable_to_tool"):
-        row[key.replace("_", " ")] = with_paper(f"{train[key]:.4g}", key)
-    row["cosine"] = with_paper(f"{cosine['mean']:.2f}", "cosine")
+        row[key.replace("_", " ")] = f"{train[key]:.4g}"
+    row["cosine"] = f"{cosine['mean']:.2f}"
     row["least to largest"] = f"{cosine['min']:.2f} to {cosine['max']:.2f}"
     row["mass (kg)"] = f"{train['mass']['mean']:.3g}"
     row["reach (m)"] = f"{train['reach']['min']:.2f} to {train['reach']['max']:.2f}"

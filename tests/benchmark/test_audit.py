@@ -11,8 +11,6 @@ from morphgen.benchmark.survey import (
     audit,
     compare_members,
     different_members,
-    paper_row,
-    paper_rows,
     statistics,
     survey_robot,
     survey_split,
@@ -25,7 +23,6 @@ from morphgen.grammar.grammar_file import find_grammar, load_grammar
 from morphgen.grammar.sampling import sample_robot
 from morphgen.grammar.syntax import Derivation
 from morphgen.progress import show_progress
-from morphgen.splits.split import split_names
 
 
 def finding_keys(example_split):
@@ -201,18 +198,6 @@ def test_a_robot_that_cannot_be_composed_is_an_error():
         statistics(split([wrong], ["chain"]), LIBRARY)
     with pytest.raises(BenchmarkError, match="a side without robots"):
         statistics(split(["cubes"], []), LIBRARY)
-
-
-def test_rows_of_the_paper_and_scenarios_match():
-    sets = {"/".join(name.split("/")[:2]) for name in split_names()}
-    assert set(paper_rows()) <= sets
-    assert sets - set(paper_rows()) == {
-        "composition/ur5-plane",
-        "extrapolation/arms-small",
-        "extrapolation/primitives-sliding",
-    }
-    assert paper_row("extrapolation/arms/push") is paper_rows()["extrapolation/arms"]
-    assert paper_row("mine/arms/push") is None
 
 
 def test_train_robots_are_compared_symmetrically_and_only_on_request():
