@@ -30,7 +30,6 @@ from morphgen.rl.observation_layout import (
 from morphgen.rl.policies import make_networks, rows_needed
 from morphgen.rl.runs.checkpoint import Interface, policy_interface, read_checkpoint
 from morphgen.rl.shipped_policies import checkpoint_path, policies_for, tasks_of
-from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.observation import Observation
 from morphgen.tasks.registry import TASKS, require_device
@@ -217,8 +216,6 @@ def make_env_and_controller(
     spec: ControllerSpec,
     robot: str | Robot,
     seed: int,
-    *,
-    kind: ActionKind | None = None,
     **options: Any,  # noqa: ANN401
 ) -> tuple[TaskEnv, Controller]:
     """Make an environment that suits a controller, and the controller.
@@ -228,13 +225,8 @@ def make_env_and_controller(
     # Evaluations of batches need neither Gymnasium nor the renderer with its video encoder.
     from morphgen.tasks.gym.env import TaskEnv
 
-    interface = vars(spec.interface)
-    if kind not in (None, spec.interface.kind) and spec.learner is not None:
-        raise TaskError(f"{spec.name}: its actions are {spec.interface.kind}, not {kind}")
     controller = make_controller(spec, seed)
-    if kind is not None:
-        interface = interface | {"kind": kind}
-    options = {"config": spec.task_config, "layouts": "eval", **interface, **options}
+    options = {"config": spec.task_config, "layouts": "eval", **vars(spec.interface), **options}
     env = TaskEnv(spec.task, robot, **options)
     if isinstance(controller, PolicyController):
         try:

@@ -250,7 +250,6 @@ evaluate("zero-shot", method="mine") => method: only with submission
 evaluate("zero-shot", "prims task=reach", on="tests") => unknown side 'tests'
 play("reach", "prims", episodes=0) => episodes 0: expected a whole number, 1
 play("push", "prims", policy="ik") => valid: scripted, zero, random
-play("reach", "prims", kind="binary") => binary
 goals("arm=ur5 ee=stick") => name one split, or say --task for a robot
 goals("interpolation/arm3/reach", obstacles=True) => obstacles: only with task
 compose(arm=None) => arm None: expected a text or a number

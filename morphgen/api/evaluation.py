@@ -53,7 +53,6 @@ from morphgen.rl.runs.training import checkpoint_files
 from morphgen.rl.scores import Evaluation, Score
 from morphgen.rl.shipped_policies import checkpoint_path, is_named
 from morphgen.splits.split import Side, require_side
-from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, require_device
 from morphgen.tasks.renderer import require_video_path, write_video
 from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
@@ -148,7 +147,6 @@ def play(
     episodes: int = 1,
     seed: int = 0,
     obstacles: bool = False,
-    kind: ActionKind | None = None,
     library: LibraryFolders = (),
     max_successes: int | None = None,
     show: Callable[[Episode], None] = lambda episode: None,
@@ -171,8 +169,6 @@ def play(
         episodes: Number of episodes.
         seed: Seed of the episodes.
         obstacles: Whether the robot is among obstacles.
-        kind: Kind of actions, ``continuous`` or ``discrete``; by default that of the checkpoint,
-            else continuous.
         library: Folders of your own parts.
         max_successes: Control steps in success, one after another, that end an episode.
         show: Function that receives each episode when it ends.
@@ -185,7 +181,7 @@ def play(
         MorphgenError: If the robot cannot be read, or cannot do the task.
     """
     given = SimpleNamespace(**locals())
-    require_types(given, TaskError, "sim", "goal", "kind", episodes=1, seed=0)
+    require_types(given, TaskError, "sim", "goal", episodes=1, seed=0)
     spec = read_controller(str(policy), text_argument("task", task, TaskError))
     video = None if out is None else path_argument("out", out, TaskError)
     if video is not None:
@@ -195,7 +191,6 @@ def play(
         spec,
         robot if isinstance(robot, Robot) else str(robot),
         seed,
-        kind=kind,
         sim=sim,
         obstacles=obstacles,
         config=config,
@@ -273,7 +268,7 @@ def _baseline_scores(given: SimpleNamespace) -> dict[str, list[Score]]:
     _prepare(sources, config)
     scores: list[Score] = []
     for source in sources:
-        with stage(robot_source.side_of(source)):
+        with stage(robot_source.side_of(source), "episode"):
             scores += evaluate_baseline(name, source, config)
     write(scores)
     return {name: scores}
@@ -326,7 +321,7 @@ def _policy_scores(given: SimpleNamespace) -> dict[str, list[Score]]:
     for mode in (given.mode,) if given.mode else MODES:
         scores = results[mode] = []
         for source in evaluated:
-            with stage(f"{mode} on {robot_source.side_of(source)}"):
+            with stage(f"{mode} on {robot_source.side_of(source)}", "episode"):
                 scores += evaluate_checkpoints(files, source, config, mode, device=given.device)
     write(chain.from_iterable(results.values()))  # a submission is of one mode
     return results

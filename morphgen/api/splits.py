@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, overload
 
 from morphgen.benchmark.hold_out import hold_out
-from morphgen.benchmark.licences import LicencedPart, licenced_parts
 from morphgen.benchmark.regimes import (
     SplitRequest,
     extrapolation,
@@ -97,19 +96,6 @@ class LoadedSplit:
         """
         return tuple(compose_side(self.definition, "test", self.library))
 
-    def licences(self) -> tuple[LicencedPart, ...]:
-        """Return the parts of the robots with their licences, and what these restrict.
-
-        Examples:
-            >>> scenario = morphgen.split("extrapolation/arms/reach")
-            >>> [part.part for part in scenario.licences() if part.licence.restrictions]
-            ['sake_ez']
-
-        Raises:
-            MorphgenError: If the library lacks a part, or a derivation is malformed.
-        """
-        return licenced_parts(self.definition, self.library)
-
     @explain_missing_extras()
     def statistics(self, *, jobs: int = 1) -> dict[str, Any]:
         """Compute sizes of the robots, and the similarity of test and train robots.
@@ -118,7 +104,7 @@ class LoadedSplit:
             jobs: Number of processes.
 
         Returns:
-            Plain data; see ``morphgen.benchmark.survey.summarize_survey``.
+            Plain data; see ``morphgen.benchmark.survey.statistics``.
 
         Raises:
             BenchmarkError: If a robot cannot be composed, or train or test is empty.
@@ -311,8 +297,7 @@ def split(
     Returns:
         The split, or for several sizes a tuple of splits. Its ``train`` and ``test`` robots are
         composed when first used. ``statistics()`` and ``audit()`` measure and compare all of them,
-        ``licences()`` lists their parts with licences and restrictions, ``write()`` writes its
-        file, ``build()`` all robots, and ``verify()`` compares them.
+        ``write()`` writes its file, ``build()`` all robots, and ``verify()`` compares them.
 
     Raises:
         BenchmarkError: If the split does not exist or is malformed; or if an argument is unknown or

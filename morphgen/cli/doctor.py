@@ -55,7 +55,6 @@ def diagnose() -> Iterator[tuple[str, Entry]]:
     for name, examine in (
         ("morphgen", _morphgen),
         ("python", _python),
-        ("cpu", _cpu),
         ("gpu", _gpu),
         ("cache", _cache),
     ):
@@ -98,14 +97,8 @@ def _morphgen() -> Entry:
 
 def _python() -> Entry:
     name = f"{platform.python_implementation()} {platform.python_version()}"
-    return Entry("python", "ok", f"{name} at {sys.executable}, {platform.platform()}")
-
-
-def _cpu() -> Entry:
-    total = os.cpu_count() or 1
-    usable = usable_cores()
-    text = f"{platform.machine()}, {usable} of {total} logical cores may be used"
-    return Entry("cpu", "ok", text)
+    cores = f"{usable_cores()} of {os.cpu_count()} logical cores may be used"
+    return Entry("python", "ok", f"{name} at {sys.executable}, {platform.platform()}; {cores}")
 
 
 def _gpu() -> Entry:

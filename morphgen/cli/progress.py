@@ -8,10 +8,8 @@ import shutil
 import sys
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
-from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from morphgen.errors import shortened
@@ -35,8 +33,7 @@ def bar(
     args: argparse.Namespace, title: str, unit: str = "robot", total: int | None = None
 ) -> Iterator[None]:
     """Show the progress of this block in a bar, and that of its stages in others; see ``_bar``."""
-    shown = _StagedBar(partial(_bar, args), unit, partial(_bar, args, title, unit, total))
-    with closing(shown), show_progress(shown):
+    with closing(_StagedBar(args, title, unit, total)) as shown, show_progress(shown):
         yield
 
 
@@ -46,18 +43,15 @@ class _StagedBar:
     _show: Progress | None = None
 
     def __init__(
-        self,
-        open_stage: Callable[[str, str], AbstractContextManager[Progress]],
-        unit: str,
-        open_bar: Callable[[], AbstractContextManager[Progress]],
+        self, args: argparse.Namespace | None, title: str, unit: str, total: int | None = None
     ) -> None:
-        self._open_stage, self._unit, self._open_bar = open_stage, unit, open_bar
+        self._bar = args, title, unit, total
         self._shown = ExitStack()
         self._show = self._open()
 
     def _open(self) -> Progress:
         self.close()
-        return self._shown.enter_context(self._open_bar())
+        return self._shown.enter_context(_bar(*self._bar))
 
     def __call__(self, done: float, total: int | None) -> None:
         """Set the bar, which is shown again if something else has taken its place."""
@@ -68,7 +62,8 @@ class _StagedBar:
     def stage(self, title: str, unit: str = "") -> Iterator[None]:
         """Show the reports of a block in a bar of its own."""
         self.close()
-        with self._open_stage(title, unit or self._unit) as show, show_progress(show):
+        args, _, own_unit, _ = self._bar
+        with _bar(args, title, unit or own_unit) as show, show_progress(show):
             yield
         self._show = self._open()
 
@@ -151,7 +146,6 @@ def track(
     """Yield the items, and show in a bar how many of them are finished."""
     with _bar(args, title, unit, total) as show:
         for done, item in enumerate(items, 1):
-            raise_if_interrupted()
             yield item
             show(done, None)
 
@@ -185,17 +179,15 @@ def _erase() -> None:
     _is_drawn = False
 
 
-@contextmanager
-def status(args: argparse.Namespace | None, text: str) -> Iterator[None]:
-    """Show on a terminal what the command does and for how long, until the work is done."""
-    with _bar(args, text):
-        yield
+def status(args: argparse.Namespace | None, text: str) -> AbstractContextManager[object]:
+    """Show what the command does and for how long, until the work is done."""
+    return _bar(args, text)
 
 
 @contextmanager
 def training_progress(how_to_resume: str | None = None) -> Iterator[TrainingProgress]:
     """Yield a display of trainings and evaluations; Ctrl-C says how to resume them."""
-    display = TrainingProgress()
+    display = TrainingProgress(None, "preparing", "goal set")
     try:
         with show_progress(display):
             yield display
@@ -211,16 +203,8 @@ def training_progress(how_to_resume: str | None = None) -> Iterator[TrainingProg
 class TrainingProgress(_StagedBar):
     """Shows goal sets, trainings and evaluations, one after the other."""
 
-    def __init__(self) -> None:
-        super().__init__(
-            partial(_bar, None), "episode", partial(_bar, None, "preparing", "goal set")
-        )
-
     def training(self, subrun: Subrun) -> ShowMetrics:
-        """Begin with a subrun; return the function that prints its updates at intervals.
-
-        At the end it is printed how many episodes diverged.
-        """
+        """Begin with a subrun; return the function that prints its updates at intervals."""
         from morphgen.rl.runs.robot_source import RecordedSource, SplitSource, tasks_of
 
         raise_if_interrupted()
@@ -229,16 +213,14 @@ class TrainingProgress(_StagedBar):
         name = source.name
         if isinstance(source, SplitSource) and source.member:
             name = source.member
-        counts = Counter[str]()
-        self._shown.callback(_print_divergence, name, counts)
         # The score of a step of push is 1 where it succeeds, else 0: its mean says nothing.
         is_relative = any(TASKS[task].relative_to_random for task in tasks_of(source))
         metric = "score" if is_relative else "reward"
-        last = -math.inf
+        last, episodes, diverged = -math.inf, 0, 0
 
         def update(report: UpdateMetrics, total: int) -> None:
-            nonlocal last
-            counts.update(episodes=report.episodes, diverged=report.unstable)
+            nonlocal last, episodes, diverged
+            episodes, diverged = episodes + report.episodes, diverged + report.unstable
             if time.monotonic() < last + LINE_INTERVAL and report.update < total:
                 return
             last = time.monotonic()
@@ -246,6 +228,8 @@ class TrainingProgress(_StagedBar):
             facts = f"{metric} {getattr(report, metric):.2f}, success {success}"
             if isinstance(source, RecordedSource):  # nothing acts
                 facts = f"loss {report.policy_loss:.3f}"
+            if diverged:
+                facts += f", simulation diverged in {diverged} of {episodes} episodes"
             # Every update has equally many transitions.
             seconds_left = (total - report.update) * report.transitions / report.update
             seconds_left /= report.steps_per_second
@@ -255,11 +239,3 @@ class TrainingProgress(_StagedBar):
             )
 
         return update
-
-
-def _print_divergence(name: str, counts: Counter[str]) -> None:
-    if counts["diverged"]:
-        note(
-            f"{name}: {counts['diverged']} of {counts['episodes']} episodes ended because their "
-            "simulation diverged"
-        )

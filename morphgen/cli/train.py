@@ -92,20 +92,17 @@ def _next_command(run: training.TrainingRun) -> str:
     program = "morphgen"
     if not all(map(TASKS.is_installed, tasks_of(source))):
         program = f"python {shlex.quote(sys.argv[0])}"
+    score = f"{program} eval {shlex.quote(folder)}"
     if isinstance(source, GrammarSource):
-        return f"score it on fresh robots: {program} eval {shlex.quote(folder)}"
+        return f"score it on fresh robots: {score}"
     if isinstance(source, RecordedSource):
-        return f"score it on other robots: {program} eval {shlex.quote(folder)} --split SPLIT"
+        return f"score it on other robots: {score} --split SPLIT"
     if isinstance(source, OneRobot):
         words = [source.task, source.name, *["--obstacles"] * source.obstacles]
         words += ["--policy", folder, "--sim", run.config.sim]
-        for library in source.library:
-            words += ["--library", str(library)]
-        return (
-            f"score it: {program} eval {shlex.quote(folder)}\n"
-            f"watch it: {program} play {shlex.join(words)} --out episode.mp4"
-        )
-    return f"score it: {program} eval {shlex.quote(folder)}"
+        words += chain.from_iterable(("--library", str(each)) for each in source.library)
+        score += f"\nwatch it: {program} play {shlex.join(words)} --out episode.mp4"
+    return f"score it: {score}"
 
 
 def finetune(args: argparse.Namespace) -> None:

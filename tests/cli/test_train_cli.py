@@ -425,7 +425,7 @@ def test_baselines_play_with_goals_that_are_poses(ok):
 
 def test_episodes_differ_and_are_reproducible(run):
     words = ("play", "reach", "arm3-stick", "--sim", "mujoco", "--episodes", "2", "--obstacles")
-    outs = [run(*words, "--seed", seed, "--kind", "discrete")[1] for seed in (1, 1, 2)]
+    outs = [run(*words, "--seed", seed)[1] for seed in (1, 1, 2)]
     assert outs[0] == outs[1] != outs[2]
     first, second = parse_episodes(outs[0])
     assert first[2:] != second[2:]

@@ -230,7 +230,7 @@ def do_cell(
             source = other_side(cell.source, side)
             if mode is None and not BASELINES[cell.agent].suits(tasks_of(source)):
                 continue  # no robot of this side has a task of the baseline
-            with stage(f"{cell.agent}{f' {name}' if mode else ''} on {side}"):
+            with stage(f"{cell.agent}{f' {name}' if mode else ''} on {side}", "episode"):
                 if mode is not None:
                     scores += evaluate_run(folder, side, eval_config, mode)
                 else:
