@@ -174,6 +174,48 @@ def episode_interval(
     return mean_interval(scores, together=together)
 
 
+POWER = 0.8  # probability that a difference shows, by convention
+_Z_LEVEL, _Z_POWER = 1.959964, 0.841621
+"""Quantiles of the normal distribution, of ``LEVEL`` on two sides and of ``POWER``."""
+
+
+def smallest_rate_difference(episodes: int) -> float:
+    """Return the smallest difference of two success rates, around 50%, that shows.
+
+    It does at ``LEVEL`` with the probability ``POWER``, where either method has so many episodes
+    (Fleiss, Levin and Paik 2003, Statistical Methods for Rates and Proportions, chapter 4, without
+    correction for continuity): d = (z1 sqrt(2 p q) + z2 sqrt(p1 q1 + p2 q2)) / sqrt(n) with
+    p1, p2 = (1 +- d) / 2. Around other rates it is smaller.
+    """
+    # With d = sin(x) it is: sqrt(2 n) sin(x) - z2 cos(x) = z1.
+    norm = math.hypot(math.sqrt(2 * episodes), _Z_POWER)
+    angle = math.asin(min(_Z_LEVEL / norm, 1)) + math.asin(_Z_POWER / norm)
+    return math.sin(min(angle, math.pi / 2))
+
+
+def smallest_mean_difference(errors: tuple[float, float]) -> float:
+    """Return the smallest difference of two means with standard errors that shows, likewise."""
+    return (_Z_LEVEL + _Z_POWER) * math.hypot(*errors)
+
+
+def mean_error(seeds: Sequence[Sequence[ArrayLike]]) -> float:
+    """Return the standard error of ``mean_interval``: of the seeds, or more of their episodes.
+
+    It is nan if there is one seed with one episode of a robot.
+    """
+    tables = [[np.asarray(samples, dtype=np.float64) for samples in strata] for strata in seeds]
+    errors = [
+        float(np.std(samples, ddof=1)) / math.sqrt(samples.size) if samples.size > 1 else math.nan
+        for strata in tables
+        for samples in strata
+    ]
+    of_episodes = math.hypot(*errors) / len(errors)
+    if len(tables) == 1:
+        return of_episodes
+    means = [np.mean([samples.mean() for samples in strata]) for strata in tables]
+    return float(np.fmax(of_episodes, np.std(means, ddof=1) / math.sqrt(len(seeds))))
+
+
 Name = Annotated[str, Meta(min_length=1, max_length=200)]
 Count = Annotated[int, Meta(ge=0, le=1_000_000_000)]
 

@@ -34,6 +34,7 @@ from morphgen.encoding.similarity import MEASURES
 from morphgen.errors import BenchmarkError
 from morphgen.formats.files import require_writable_folder
 from morphgen.model.findings import Finding
+from morphgen.rl.scores import POWER
 from morphgen.splits.split import (
     HOLD_OUT,
     SIDES,
@@ -302,16 +303,22 @@ def score(args: argparse.Namespace) -> int:
     with status(args, "scoring"):
         own = dict(zip(map(str, args.submissions), submissions, strict=True))
         rows = scores.ranked([*scores.scored_rows(own, random), *references.rows()])
+    smallest, lowest = scores.smallest_differences(rows), scores.floor([each for _, each in named])
     data: dict[str, Any] = {
         "split": split.name,
         "random": "release" if random else "submission",
         "warnings": warnings,
         "rows": scores.rows_data(rows),
+        "smallest_differences": smallest,
+        "floor": lowest,
     }
     replays = _replays(args, submissions, split) if args.replay else []
     if args.replay:
         data["replays"] = [{"episode": line, "agrees": agrees} for line, agrees in replays]
-    notes = [scores.NOTE]
+    notes = [scores.NOTE, *map(_smallest_text, smallest)]
+    for task, rates in lowest.items():
+        names = ", ".join(f"{name} {rate:.0%}" for name, rate in rates.items())
+        notes.append(f"floor of success of {task} (ZS): {names}")
     if relative:
         whose = "the release" if random else "each submission"
         notes.append(
@@ -355,6 +362,14 @@ def _replays(
             ):
                 found.append((f"{path}: {episode}", episode.agrees))
     return found
+
+
+def _smallest_text(values: Mapping[str, Any]) -> str:
+    score = f", {values['score']:.3g} of scores" if values["score"] is not None else ""
+    return (
+        f"smallest difference of {values['task']} (ZS) that shows with {POWER:.0%} power: "
+        f"{values['success']:.1%} of success around 50% in {values['episodes']} episodes{score}"
+    )
 
 
 def _open(name: str, stack: ExitStack) -> tuple[Split, EvalProtocol, scores.References, str]:

@@ -1,6 +1,7 @@
 """Scores of submissions, their ranking, and the reference scores of releases and studies."""
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from helpers.submissions import (
 from morphgen.benchmark.scores import results as results_module
 from morphgen.benchmark.scores.results import (
     collect_references,
+    floor,
     random_scores,
     ranked,
     read_references,
@@ -27,6 +29,7 @@ from morphgen.benchmark.scores.results import (
     result_tables,
     rows_data,
     scored_rows,
+    smallest_differences,
 )
 from morphgen.benchmark.scores.submission import (
     EPISODES,
@@ -36,6 +39,7 @@ from morphgen.benchmark.scores.submission import (
 )
 from morphgen.errors import BenchmarkError
 from morphgen.grammar.library import default_library
+from morphgen.rl.scores import smallest_rate_difference
 
 LIBRARY = default_library()
 
@@ -55,6 +59,19 @@ def stored(folder, **submissions):
     for name, values in submissions.items():
         (folder / f"{name}.json").write_text(json.dumps(values))
     return [folder / f"{name}.json" for name in submissions]
+
+
+def test_the_floor_and_the_smallest_difference_are_computed():
+    rows = scored_rows({"a": submission(), "b": submission(data("other"))})
+    (values,) = smallest_differences(rows)
+    assert (values["task"], values["episodes"]) == ("reach", 4)
+    assert values["success"] == smallest_rate_difference(4)
+    assert values["score"] == pytest.approx(
+        2.8016 * math.sqrt(2) * np.std([150, 151, 152, -1]) / math.sqrt(3), rel=1e-3
+    )
+    assert floor([submission()]) == {"reach": {"random": 0.0}}
+    zero = submission(data("zero", successes=1) | BASELINE)
+    assert floor([submission(), zero]) == {"reach": {"zero": 0.25, "random": 0.0}}
 
 
 def test_the_random_scores_of_a_release_replace_those_of_a_submission():

@@ -526,10 +526,22 @@ def test_seeds_are_the_unit_of_an_interval():
     # Two strata are independent samples of seeds.
     apart = scoring.mean_interval(seeds, together=False)
     assert found.high - found.low > apart.high - apart.low > 1
+    assert scoring.mean_error(seeds) == pytest.approx(10 / math.sqrt(12), rel=0.1)
+    assert scoring.mean_error([[[0.0, 2.0], [1.0, 3.0]]]) == pytest.approx(1 / math.sqrt(2))
     certain = [[[True] * 20] * 2] * 3
     assert scoring.seeds_success_interval(certain) == success_interval(1, 120)
     differing = scoring.seeds_success_interval([[[True] * 20], [[False] * 20]])
     assert (differing.low, differing.high) == (0, 1)
+
+
+@pytest.mark.parametrize("episodes", [34, 340])
+def test_the_smallest_difference_of_rates_follows_from_the_number_of_episodes(episodes):
+    difference = scoring.smallest_rate_difference(episodes)
+    low, high = (1 - difference) / 2, (1 + difference) / 2
+    spread = 1.959964 * math.sqrt(0.5) + 0.841621 * math.sqrt(low * (1 - low) + high * (1 - high))
+    assert episodes == pytest.approx((spread / difference) ** 2)  # Fleiss' formula for n
+    assert scoring.smallest_rate_difference(1) == 1
+    assert scoring.smallest_mean_difference((3.0, 4.0)) == pytest.approx(2.8016 * 5, abs=1e-3)
 
 
 @pytest.mark.parametrize("value", [0, 1])

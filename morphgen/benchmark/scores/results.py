@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
+import numpy as np
 
 from morphgen.benchmark.release import SCORES_FILE, SUBMISSIONS_DIR
 from morphgen.benchmark.scores.submission import (
@@ -35,6 +36,7 @@ from morphgen.errors import BenchmarkError
 from morphgen.formats.data_files import read_json
 from morphgen.grammar.library import Library
 from morphgen.rl.agents import AGENTS
+from morphgen.rl.baselines import ZERO
 from morphgen.rl.scores import SIDES as SIDE_NAMES
 from morphgen.rl.scores import (
     Interval,
@@ -42,10 +44,13 @@ from morphgen.rl.scores import (
     RobotOutcomes,
     episode_interval,
     finite_or_none,
+    mean_error,
     mean_interval,
     relative_scores,
     score_decimals,
     seeds_success_interval,
+    smallest_mean_difference,
+    smallest_rate_difference,
 )
 from morphgen.splits.split import SIDES, Side, Split, read_split, split_id, split_names
 from morphgen.tables import table
@@ -53,6 +58,37 @@ from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
 
 Source = Literal["submission", "reference"]
+
+
+def smallest_differences(rows: Sequence[ResultRow]) -> list[dict[str, Any]]:
+    """Return the smallest differences that the test episodes of any two rows show, by task.
+
+    ``success`` is that of two rates around 50%, from the row with the fewest episodes; ``score``
+    that of the rows with the largest standard errors, None if one is not known.
+    """
+    found = []
+    for task in sorted({row.task for row in rows if "test" in row.sides}):
+        own = [row.sides["test"] for row in rows if row.task == task and "test" in row.sides]
+        episodes = min(side.episodes for side in own)
+        errors = np.sort([side.error for side in own])  # nan last
+        largest = float(errors[-1]), float(errors[-min(2, len(errors))])
+        values = {"task": task, "episodes": episodes, "success": smallest_rate_difference(episodes)}
+        found.append(finite_or_none(values | {"score": smallest_mean_difference(largest)}))
+    return found
+
+
+def floor(submissions: Sequence[Submission]) -> dict[str, dict[str, float]]:
+    """Return the success rate on the test robots of ``zero`` and ``random``, by task and name."""
+    rates: dict[str, dict[str, float]] = {}
+    for name in (ZERO.name, RANDOM):
+        own = next((each for each in submissions if _is_baseline(each, name)), None)
+        known = own or (submissions[0] if name == RANDOM else None)
+        for task in TASKS if known else ():
+            robots = _outcomes(known, "test", task).values() if known else ()
+            lists = [each.success if own else each.random_success for each in robots]
+            if lists and all(lists):
+                rates.setdefault(task, {})[name] = float(np.mean(list(map(np.mean, lists))))
+    return rates
 
 
 def random_scores(submission: Submission) -> RandomScores:
@@ -82,7 +118,7 @@ class References:
     @property
     def random(self) -> RandomScores | None:
         """Scores of the random policy, if the release holds a submission of it."""
-        baselines = (each for each in self.submissions if _is_random(each))
+        baselines = (each for each in self.submissions if _is_baseline(each, RANDOM))
         return next(map(random_scores, baselines), None)
 
     def rows(self) -> list[ResultRow]:
@@ -104,7 +140,7 @@ def collect_references(
                 continue
             expected = expected or expected_robots(split, protocol, library, jobs=jobs)
             check_submission(each, where, split, protocol, expected, version("morphgen"))
-            if _is_random(each) and len(each.robots) < len(expected):
+            if _is_baseline(each, RANDOM) and len(each.robots) < len(expected):
                 raise BenchmarkError(
                     f"{where}: {RANDOM}: the train robots are missing, to whose episodes the "
                     "scores of other submissions are relative; evaluate it on both sides"
@@ -134,10 +170,10 @@ def read_references(folder: Path) -> References:
     return References(tuple(submission_from(read_json(file), file) for file in files))
 
 
-def _is_random(submission: Submission) -> bool:
-    """Return whether a submission is of the random policy, not of a trained one with its name."""
+def _is_baseline(submission: Submission, name: str) -> bool:
+    """Return whether a submission is of this baseline, not of a policy with its name."""
     is_trained = submission.mode != "" or submission.training_seed is not None
-    return submission.method == RANDOM and not is_trained
+    return submission.method == name and not is_trained
 
 
 def _path(submission: Submission) -> str:
@@ -172,6 +208,7 @@ class SideResult:
     robots: int
     episodes: int  # number of episodes of all robots and seeds
     score: Interval  # mean score over seeds and robots; see `episode_interval`
+    error: float  # standard error of the mean score; see `mean_error`
     success: Interval  # mean success rate; see `seeds_success_interval`
     difference: Interval | None
     """Score minus that of the reference in the same episodes, see `mean_interval`; None without a
@@ -309,6 +346,7 @@ def _side_results(
                     relative=TASKS[task].relative_to_random,
                     together=together,
                 ),
+                mean_error(scores),
                 seeds_success_interval(successes, together=together),
                 _difference(
                     tables,
