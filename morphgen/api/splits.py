@@ -11,6 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, overload
 
+from morphgen.benchmark.composition import composition
 from morphgen.benchmark.hold_out import hold_out
 from morphgen.benchmark.regimes import (
     SplitRequest,
@@ -286,8 +287,8 @@ def split(
             - ``hold_out``: parts (``arm=kinova*``), a manufacturer (``manufacturer=Kinova``) or
               a combination (``arm=ur5+ee=plane``)
             - ``regime``: ``interpolation`` with ``grammar`` and ``hull`` (``inside``, ``outside``
-              or ``any``); ``extrapolation`` with ``train_category`` and
-              ``test_category`` (grammars)
+              or ``any``); ``composition`` with ``robots``; ``extrapolation`` with
+              ``train_category`` and ``test_category`` (grammars)
             - ``robots``: words of ``compose`` with choices in braces and wildcards, by default
               ``arm=* ee=*``; ``grammar``: grammars to draw from
             - ``test``: number of test robots, by default 1; ``task``: by default ``reach``;
@@ -325,6 +326,7 @@ def split(
 
 _RULES: Mapping[Regime, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "interpolation": (("grammar",), ("hull",)),
+    "composition": (("robots",), ()),
     "extrapolation": (("train_category", "test_category"), ()),
     "hold-out": (("hold_out",), ("robots", "grammar")),
 }
@@ -392,6 +394,10 @@ def _word(regime: Regime, rules: Rules) -> str:
     if regime == HOLD_OUT:
         words = re.findall(r"[A-Za-z0-9_.]+", ",".join(rules["hold_out"]))
         return "-".join(words)[:MAX_WORD].strip("-.")
+    if regime == "composition":
+        words = " ".join(rules["robots"]).split()
+        keys = dict.fromkeys(word.partition("=")[0] for word in words if "={" in word)
+        return "-".join(keys) or "robots"
     grammars = [Path(name).stem for name in rules.get("test_category") or rules["grammar"]]
     return "-".join([*grammars, *(hull for hull in rules.get("hull", ()) if hull != "any")])
 
@@ -408,6 +414,8 @@ def _choose(
         if regime == "interpolation":
             hull = ",".join(rules.get("hull", ("any",)))
             return interpolation(request, grammars[0], library, hull=hull, jobs=jobs)
+        if regime == "composition":
+            return composition(request, patterns, library, jobs=jobs)
         if regime == "extrapolation":
             return extrapolation(request, train, test, library, jobs=jobs)
         held_out = rules["hold_out"]

@@ -241,6 +241,17 @@ class RuledRobot:
         """See ``parts``."""
         return parts(self.derivation)
 
+    @property
+    def outermost(self) -> str:
+        """The last part of the robot, usually the end-effector."""
+        *_, last = (node.part for node in self.derivation.walk() if node.part != NOTHING)
+        return last
+
+    @cached_property
+    def covers(self) -> frozenset[str]:
+        """The parts and the task that training with this robot covers."""
+        return self.parts | {f"task {self.task}"}
+
     @cached_property
     def parameters(self) -> list[float]:
         """Values of ``parameters``."""
@@ -415,7 +426,7 @@ def _drawn_splits(
         if twin := name_by_hash.get(robot.hash):
             return f"the body of {twin}"
         # A robot has another derivation if the conditions of its grammar reject the first one.
-        reasons = (_near_reason(robot, side) for side in sides)
+        reasons = (near_reason(robot, side) for side in sides)
         return violated(robot.derivation) or next(filter(None, reasons), "")
 
     test: list[Candidate] = []
@@ -514,7 +525,7 @@ def interpolation(
     )
 
 
-def _near_reason(robot: Candidate, others: Iterable[Candidate]) -> str:
+def near_reason(robot: Candidate, others: Iterable[Candidate]) -> str:
     """Return the first robot that the audit would call nearly the same; empty if none is."""
     for other in others:
         if robot.features and other.features and is_near(robot.features, other.features):

@@ -192,7 +192,7 @@ def new(args: argparse.Namespace) -> None:
     if args.subcommand is None and not args.hold_out:
         args.parser.error(
             "name what to hold out, such as --hold-out 'arm=kinova*', or a regime: interpolation, "
-            "extrapolation"
+            "composition, extrapolation"
         )
     choice = opt.given(args, NewSplit.__annotations__)
     choice["regime"] = args.subcommand or HOLD_OUT

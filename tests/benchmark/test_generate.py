@@ -10,6 +10,7 @@ import morphgen
 from helpers.grammars import grammar, shipped
 from helpers.splits import LIBRARY, derivations, names, order, require_sound
 from morphgen.benchmark import regimes
+from morphgen.benchmark.composition import composition
 from morphgen.benchmark.regimes import (
     combination,
     extrapolation,
@@ -100,6 +101,11 @@ def test_progress_reaches_the_total():
     with show_progress(lambda done, total: told.append(done)):
         interpolation(order(3, test=2), shipped("cubes"), LIBRARY)
     assert told == [1, 2, 3, 4, 5]
+    told.clear()
+    patterns = ["base=gantry ee={plane,cube}", "base=fixed arm=lwr ee={plane,cube}"]
+    with show_progress(lambda done, total: told.append(done)):
+        composition(order(2), patterns, LIBRARY)
+    assert told == [1, 2, 3]
 
 
 def test_train_robots_are_never_test_robots(monkeypatch):

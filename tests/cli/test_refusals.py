@@ -88,7 +88,7 @@ check a --strct => unknown option '--strct'; did you mean '--strict'?
 check a --strct => ; see morphgen check --help
 list arms legs => unknown arguments: legs; see morphgen list --help
 split => the following arguments are required
-split new => --hold-out 'arm=kinova*', or a regime: interpolation, extrapolation; see
+split new => --hold-out 'arm=kinova*', or a regime: interpolation, composition, extrapolation; see
 split new interpolation => the following arguments are required
 EXTRAPOLATION stick, --test-category chain => unknown grammar ''
 CUBES --train 3,x => argument --train: x: expected a whole number, 1 or more
@@ -96,8 +96,8 @@ CUBES --train '' => --train and --test start at 1
 CUBES --out file/x.yaml => cannot write file/x.yaml: 
 HOLD_OUT --grammar arm33 => 'arm33'; did you mean 'arm3'?
 HOLD_OUT --name ../x => name '../x': use letters, digits
-HOLD_OUT interpolation --grammar x => --hold-out before interpolation: options stand after it
-split new --seed 5 extrapolation => --seed before extrapolation: options stand after it
+HOLD_OUT composition --from ee=plane => --hold-out before composition: options stand after it
+split new --seed 5 composition => --seed before composition: options stand after it
 split show interpolation/arm3 => no split of this name; did you mean
 split audit broken.yaml => broken.yaml:
 split build some.yaml --out file => cannot write to file/mine/some: Not a directory

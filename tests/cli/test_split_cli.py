@@ -14,6 +14,8 @@ from morphgen.splits.split import read_split, split_id, split_names, split_text
 from morphgen.tasks.split_goals import read_goals
 
 INTERPOLATION = ("split", "new", "interpolation", "--grammar", "cubes", "--train", "3")
+COMPOSITION = ("split", "new", "composition", "--from", "base=gantry ee={plane,cube}")
+COMPOSITION += ("--from", "arm=lwr ee={plane,cube}", "--train", "3")
 EXTRAPOLATION = ("split", "new", "extrapolation", "--train-category", "stick,nlink,prims")
 EXTRAPOLATION += ("--test-category", "chain", "--train", "6")
 HOLD_OUT = ("split", "new", "--hold-out", "ee=plane", "--train", "2")
@@ -73,6 +75,7 @@ def test_new_prints_a_summary_and_the_next_command(run, ok, tmp_path):
             *(INTERPOLATION, "--hull inside --task push --obstacles"),
             *("interpolation-cubes-inside-push-obstacles-seed0", (3, 1)),
         ),
+        (COMPOSITION, "", "composition-ee-reach-seed0", (3, 1)),
         (HOLD_OUT, "", "hold-out-ee-plane-reach-seed0", (2, 1)),
         (
             *(HOLD_OUT, "--hold-out arm=arm3 --test 2 --task push"),
