@@ -349,9 +349,10 @@ def release_split(
     *,
     extra: Mapping[str, bytes] | None = None,
     jobs: int = 1,
+    checked: tuple[Release, tuple[licences.LicencedPart, ...]] | None = None,
 ) -> ReleaseReport:
-    """Write the archive of a release into a folder."""
-    release, parts = check_release(split, library, request, jobs=jobs)
+    """Write the archive of a release into a folder; ``checked`` is from ``check_release``."""
+    release, parts = checked or check_release(split, library, request, jobs=jobs)
     goals: list[GoalResult] = []
     if request.goals:
         goals = sample_split_goals(split, library, request.protocol.goals, jobs=jobs)

@@ -26,6 +26,7 @@ from morphgen.benchmark.scores.submission import (
     read_submission,
     read_submissions,
     require_same_random,
+    tasks_of_split,
 )
 from morphgen.benchmark.survey import Audit, statistics
 from morphgen.cli import options as opt
@@ -256,9 +257,19 @@ def release(args: argparse.Namespace) -> None:
         protocol=protocol,
         goals=not args.no_goals,
     )
+    with bar(args, "checking"):
+        checked = releases.check_release(split, library, request, jobs=args.jobs)
+    archive = args.out / f"{checked[0].stem}.zip"
+    notes = _notes(args, archive, split, extra)
+    if not args.json:
+        print("".join(f"note: {note}\n" for note in notes), end="", flush=True)
+    if args.dry_run:
+        text = f"{archive} would be written: names, licences and audit are in order"
+        opt.print_result(args, {"archive": str(archive), "notes": notes}, lambda: text)
+        return
     with bar(args, "releasing"):
         report = releases.release_split(
-            split, args.out, library, request, extra=extra, jobs=args.jobs
+            split, args.out, library, request, extra=extra, jobs=args.jobs, checked=checked
         )
     lines = [
         f"{report.archive}: {report.files} files, {report.bytes / 1e6:.2f} MB",
@@ -266,7 +277,30 @@ def release(args: argparse.Namespace) -> None:
         f"  content: {report.content}",
         f"verify it anywhere: morphgen split verify {report.archive}",
     ]
-    opt.print_result(args, vars(report), lambda: "\n".join(lines))
+    opt.print_result(args, {**vars(report), "notes": notes}, lambda: "\n".join(lines))
+
+
+def _notes(
+    args: argparse.Namespace, archive: Path, split: Split, extra: Mapping[str, bytes]
+) -> list[str]:
+    """Return what the release lacks that its users may expect, and what may keep it from it."""
+    notes = []
+    if archive.exists():
+        notes.append(f"{archive} exists: it stays, unless the content is the same")
+    is_relative = any(TASKS[task].relative_to_random for task in tasks_of_split(split))
+    if is_relative and f"{releases.SUBMISSIONS_DIR}/random.json" not in extra:
+        missing = "submission of random among --scores" if extra else "reference scores"
+        notes.append(
+            f"no {missing}: split score cannot check the random_score of submissions; add one of "
+            "morphgen eval random --submission with --scores"
+        )
+    elif not extra:
+        notes.append("no reference scores: add submissions or studies with --scores")
+    if not args.date:
+        notes.append("no --date: dataset tools recommend a date of publication")
+    if not args.creator:
+        notes.append("no --creator: the citation will name nobody")
+    return notes
 
 
 def score(args: argparse.Namespace) -> int:

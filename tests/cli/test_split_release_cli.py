@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from helpers.commands import tree
 from helpers.splits import TRAIN, combined, member
 from helpers.submissions import data
 from morphgen.benchmark.scores.submission import EvalProtocol, expected_robots
@@ -20,16 +21,38 @@ RELEASE = ("split", "release", "--no-goals")
 
 def test_release_prints_archive_and_hashes_and_passes_verify(run, ok, small):
     out = ok(*RELEASE, small, "--version", "2.0.0")
-    first, sha256, content, last = out.splitlines()
+    *notes, first, sha256, content, last = out.splitlines()
     archive = "releases/mine-small-2.0.0.zip"
     assert first.startswith(f"{archive}: ")
     assert last == f"verify it anywhere: morphgen split verify {archive}"
     out = ok(*RELEASE, small, "--version", "2.0.0", "--json")
     data = json.loads(out)
     assert (f"  sha256: {data['sha256']}", f"  content: {data['content']}") == (sha256, content)
+    kept, *others = data["notes"]
+    assert kept == f"{archive} exists: it stays, unless the content is the same"
+    assert [f"note: {note}" for note in others] == notes
+    lacks = ["no reference scores", "no --date", "no --creator"]
+    assert [note.partition(":")[0] for note in others] == lacks
+    cited = ("--date", "2027-01-31", "--creator", "us", "--out", "dated")
+    assert run(*RELEASE, small, *cited)[1].count("note: ") == 1
     out = ok("split", "verify", archive)
     assert out.splitlines()[1] == content
     assert [path.name for path in Path("releases").iterdir()] == ["mine-small-2.0.0.zip"]
+
+
+def test_a_dry_run_says_what_is_missing_and_writes_nothing(ok, run, small, tmp_path):
+    before = tree(tmp_path)
+    *notes, last = ok("split", "release", small, "--dry-run", "--date", "2027-01-31").splitlines()
+    lacks = ["no reference scores", "no --creator"]
+    assert [note.partition(":")[2].strip().split(":")[0] for note in notes] == lacks
+    archive = "releases/mine-small-1.0.0.zip"
+    assert last == f"{archive} would be written: names, licences and audit are in order"
+    data = json.loads(ok("split", "release", small, "--dry-run", "--json"))
+    assert (data["archive"], len(data["notes"])) == (archive, 3)
+    assert tree(tmp_path) == before
+    code, _, err = run("split", "release", "composition/ee-arm/reach", "--dry-run")
+    assert code == 2
+    assert "sake_ez" in err
 
 
 def test_a_tampered_archive_fails_verify_and_ranks_nothing(run, refused, small):
@@ -102,7 +125,11 @@ def test_edited_random_scores_do_not_pass_unnoticed(run, ok, refused, small):
         assert out.splitlines()[-1] == f"warning: {warning}"
         assert warning.startswith("random_score was not checked: there is no reference submission")
     assert "b.json: test robot planar-plane: random_score: " in refused(*score, "a.json", "b.json")
-    run(*RELEASE, small, "--scores", "random.json", "--version", "1.1.0")
+    out = run(*RELEASE, small, "--scores", "a.json")[1]
+    assert "note: no submission of random among --scores: " in out
+    out = run(*RELEASE, small, "--scores", "random.json", "--version", "1.1.0")[1]
+    assert "no submission of random" not in out
+    assert "no reference scores" not in out
     words = ("split", "score", "b.json", "--split", "releases/mine-small-1.1.0.zip", "--json")
     ranking = json.loads(run(*words)[1])
     assert (ranking["random"], ranking["warnings"]) == ("release", [])
