@@ -94,6 +94,8 @@ CURVE_COLOURS = ("#2b6cb0", "#38a169", "#d69e2e", "#c53030", "#805ad5")
 sys.path.append(str(ROOT / "benchmarks"))
 CURVE = runpy.run_path(str(ROOT / "benchmarks/robot_curve.py"))
 CURVE_OPTIONS = CURVE["arguments"](["--report", "--out", str(ROOT / "results/robot-curve.json")])
+LAW = runpy.run_path(str(ROOT / "benchmarks/scaling_law.py"))
+LAW_NUMBERS, LAW_SEEDS = (1, 3, 10, 30, 100, 1000), (0, 1)
 TRANSFER = runpy.run_path(str(ROOT / "benchmarks/similarity_transfer.py"))
 SHIPPED_ARMS = runpy.run_path(str(ROOT / "benchmarks/zero_shot_arms.py"))
 
@@ -390,6 +392,12 @@ def curve_table(name: str) -> str:
     return str(CURVE["table"](name, CURVE_OPTIONS))
 
 
+def law_tables() -> str:
+    """Return the tables of benchmarks/scaling_law.py."""
+    cells = LAW["read_cells"](ROOT / "results/scaling-law.json")
+    return str(LAW["report"](cells, ["pose"], LAW_NUMBERS, LAW_SEEDS))
+
+
 def write_tables(tables: Mapping[str, str], page: Path) -> str:
     """Return the text of a page with its tables replaced.
 
@@ -518,6 +526,7 @@ def _all_tables() -> dict[str, str]:
         "fine-tuning": fine_tuning_table(),
         "pybullet": pybullet_table(),
         **{f"robots-{name}": curve_table(name) for name in CURVE["VARIANTS"]},
+        "law": law_tables(),
         "similarity": TRANSFER["table"](similarity_rows()),
     }
 

@@ -8,6 +8,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from morphgen.benchmark.scores.submission import EPISODES, read_table
@@ -95,6 +96,16 @@ def test_the_docs_have_the_table_of_the_stored_conformance(monkeypatch, capsys):
     assert run_here("python benchmarks/conformance.py --report", monkeypatch) == 0
     text = (ROOT / "benchmarks" / "README.md").read_text("utf-8")
     assert capsys.readouterr().out.rstrip() in "\n".join(map(str.rstrip, text.splitlines()))
+
+
+def test_the_law_of_made_failures_is_found():
+    fitted = runpy.run_path(str(ROOT / "benchmarks" / "scaling_law.py"))["fitted"]
+    robots = np.array([1.0, 3.0, 10.0, 30.0, 100.0])
+    failures = np.array([0.1 + 0.6 * robots**-0.5, np.full(5, 0.3), 0.8 * robots**-0.2])
+    floor, factor, exponent = fitted(robots, failures)
+    assert floor == pytest.approx([0.1, 0.3, 0.0], abs=1e-6)
+    assert factor == pytest.approx([0.6, 0.0, 0.8], abs=1e-6)
+    assert exponent == pytest.approx([0.5, np.nan, 0.2], abs=1e-6, nan_ok=True)
 
 
 def test_the_docs_have_the_constants_of_the_stored_runs():
