@@ -41,6 +41,7 @@ from morphgen.rl.scores import (
 )
 from morphgen.rl.shipped_policies import name_of
 from morphgen.splits.split import Side
+from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, evaluation_simulator
 from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
 from morphgen.tasks.scenes.make import batch_from_specs
@@ -222,29 +223,61 @@ def run_all(
 ) -> list[list[Episode]]:
     """Return episodes by robot, from as many batches as the simulator's limit makes necessary."""
     rounds, envs_per_robot = _rounds(config)
-    simulator = SIMULATORS[config.sim]
-    batch_envs = max(simulator.max_envs // len(specs), 1)  # per robot
+    make_batch = _make_batch(specs, config, interface, library)
+    batch_envs = max(SIMULATORS[config.sim].max_envs // len(specs), 1)  # per robot
     episodes: list[list[Episode]] = [[] for _ in specs]
     controller: Controller | None = None
     total = envs_per_robot * rounds * len(specs)
     for first in range(0, envs_per_robot, batch_envs):
         num_envs = min(batch_envs, envs_per_robot - first) * len(specs)
-        batch = batch_from_specs(
-            specs,
-            num_envs,
-            first=first * len(specs),
-            sim=config.sim,
-            seed=int(np.random.SeedSequence([EVAL_SEED_OFFSET, config.seed]).generate_state(1)[0]),
-            workers=config.workers,
-            layouts="eval",
-            device=simulator.devices[0],
-            library=library,
-            **vars(interface),
-        )
+        batch = make_batch(num_envs, first=first * len(specs))
         with closing(batch), part_of(total, first * rounds * len(specs)):
             controller = controller or make()
             for episode in run_episodes(batch, controller, rounds):
                 episodes[episode.robot_index].append(episode)
+    return episodes
+
+
+def _make_batch(
+    specs: Sequence[EnvSpec], config: EvalConfig, interface: Interface, library: tuple[Path, ...]
+) -> Callable[..., TaskBatch]:
+    """Return ``batch_from_specs`` for an evaluation; it takes ``num_envs`` and ``first``."""
+    return partial(
+        batch_from_specs,
+        specs,
+        sim=config.sim,
+        seed=int(np.random.SeedSequence([EVAL_SEED_OFFSET, config.seed]).generate_state(1)[0]),
+        workers=config.workers,
+        layouts="eval",
+        device=SIMULATORS[config.sim].devices[0],
+        library=library,
+        **vars(interface),
+    )
+
+
+def episodes_alone(
+    controller: Controller,
+    interface: Interface,
+    source: Source,
+    config: EvalConfig,
+    chosen: Sequence[tuple[str, int]],
+    *,
+    tasks: tuple[str, ...] | None = None,
+) -> list[Episode]:
+    """Run episodes of an evaluation again, by the robot's name and their number, each in a batch.
+
+    They are those of ``evaluate`` up to rounding, which depends on the size of a batch, if an
+    action depends on the state of its environment alone.
+    """
+    specs, (rounds, _) = _specs(source, config, tasks), _rounds(config)
+    robots = {spec.robot.name: i for i, spec in enumerate(specs)}
+    make_batch = _make_batch(specs, config, interface, tuple(map(Path, source.library)))
+    episodes = []
+    for i, (robot, number) in enumerate(chosen):
+        env, earlier = divmod(number, rounds)
+        batch = make_batch(1, first=env * len(specs) + robots[robot])
+        with closing(batch), part_of(len(chosen), i):
+            episodes.append(run_episodes(batch, controller, earlier + 1)[-1])
     return episodes
 
 

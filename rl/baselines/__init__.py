@@ -35,6 +35,8 @@ class Baseline:
     """Import path of the controller's class, as ``module:class``; imported when it is used."""
     tasks: tuple[str, ...] | None = None
     """Tasks that the baseline is for; None for all tasks."""
+    is_independent: bool = False
+    """Whether an action depends on the state of its environment alone."""
 
     def suits(self, tasks: Iterable[str]) -> bool:
         """Return whether the baseline is for any of the tasks."""
@@ -48,8 +50,10 @@ class Baseline:
 
 
 RANDOM = Baseline("random", "morphgen.rl.baselines.reach:Random")
-ZERO = Baseline("zero", "morphgen.rl.baselines.reach:Zero")
-JACOBIAN = Baseline("jacobian", "morphgen.rl.baselines.reach:JacobianColumns", ("reach",))
+ZERO = Baseline("zero", "morphgen.rl.baselines.reach:Zero", is_independent=True)
+JACOBIAN = Baseline(
+    "jacobian", "morphgen.rl.baselines.reach:JacobianColumns", ("reach",), is_independent=True
+)
 IK = Baseline("ik", "morphgen.rl.baselines.reach:InverseKinematics", ("reach",))
 SCRIPTED = Baseline(
     "scripted",

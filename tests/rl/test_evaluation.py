@@ -12,8 +12,16 @@ from helpers.splits import member, split
 from morphgen.errors import TaskError
 from morphgen.progress import show_progress
 from morphgen.rl import evaluation
-from morphgen.rl.evaluation import EvalConfig, evaluate_baseline, evaluate_checkpoints, evaluate_run
-from morphgen.rl.runs.checkpoint import read_checkpoint, write_checkpoint
+from morphgen.rl.baselines import ZERO
+from morphgen.rl.evaluation import (
+    EvalConfig,
+    episodes_alone,
+    evaluate_baseline,
+    evaluate_checkpoints,
+    evaluate_run,
+)
+from morphgen.rl.inference import Policy, PolicyController
+from morphgen.rl.runs.checkpoint import CHECKPOINT, Interface, read_checkpoint, write_checkpoint
 from morphgen.rl.runs.robot_source import other_side, robot_source, split_source
 from morphgen.rl.runs.training import checkpoint_files, subruns_of, train
 from morphgen.rl.scores import Evaluation, scores_to_json
@@ -96,6 +104,23 @@ def test_evaluation_in_several_batches_has_the_same_episodes(run, monkeypatch):
     assert [each.distance for each in parts] == pytest.approx([each.distance for each in whole])
     again = evaluate_baseline("zero", source, config)
     assert [each.raw for each in again] == pytest.approx([each.raw for each in still])
+
+
+def test_single_episodes_are_those_of_the_evaluation_of_baseline_and_policy(run, monkeypatch):
+    monkeypatch.setattr(evaluation, "MAX_ENVS_PER_ROBOT", 2)  # two episodes one after another
+    config, source = replace(EVAL, episodes=3), other_side(small_source(), "train")
+    policies = evaluate_checkpoints([run / CHECKPOINT], source, config, "deterministic")
+    whole = evaluate_baseline("zero", source, config), policies
+    trained, learner = read_checkpoint(run / CHECKPOINT)
+    policy = PolicyController(Policy(learner, "deterministic", 0))
+    controllers = (ZERO.make(0), Interface()), (policy, trained.interface)
+    for scores, controller in zip(whole, controllers, strict=True):
+        outcomes = {each.robot: each.outcomes.distance for each in scores}
+        chosen = [(robot, number) for robot in reversed(outcomes) for number in (3, 0, 1)]
+        found = episodes_alone(*controller, source, config, chosen)
+        expected = [outcomes[robot][number] for robot, number in chosen]
+        assert [each.distance for each in found] == pytest.approx(expected, abs=1e-4)
+        assert len({round(each, 4) for each in expected}) == len(expected)
 
 
 def test_push_scores_are_success_rates_and_baselines_reject_other_tasks():

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,15 +29,18 @@ from morphgen.rl.baselines import BASELINES
 from morphgen.rl.demonstrations.recording import TOLERANCE
 from morphgen.rl.evaluation import (
     EvalConfig,
+    episodes_alone,
     evaluate_baseline,
     evaluate_checkpoints,
     evaluate_run,
 )
-from morphgen.rl.inference import MODES, Mode
+from morphgen.rl.inference import MODES, Episode, Mode, Policy, PolicyController
 from morphgen.rl.runs.checkpoint import (
     CHECKPOINT,
+    Interface,
     RunConfig,
     config_from,
+    read_checkpoint,
     require_open,
     require_same_config,
 )
@@ -350,27 +354,27 @@ def write_tables(folder: Path, cells: Sequence[Cell]) -> list[Path]:
 
 @dataclass(frozen=True)
 class ReplayedEpisode:
-    """An episode of a submission beside the same one in an evaluation that was run again."""
+    """An episode of a submission, and what it gave when it was run again."""
 
     robot: RobotOutcomes
     number: int  # number of the episode, from 0
-    again: RobotOutcomes
+    again: tuple[bool, float]  # success and final distance [m]
 
     @property
     def agrees(self) -> bool:
         """Whether success and final distance [m] are those of the submission."""
-        (won, far), (won_again, far_again) = self._outcomes
-        return won == won_again and abs(far - far_again) <= TOLERANCE
+        won, distance = self._outcome
+        return won == self.again[0] and abs(distance - self.again[1]) <= TOLERANCE
 
     @property
-    def _outcomes(self) -> list[tuple[bool, float]]:
-        both = (self.robot, self.again)
-        return [(each.success[self.number], each.distance[self.number]) for each in both]
+    def _outcome(self) -> tuple[bool, float]:
+        return self.robot.success[self.number], self.robot.distance[self.number]
 
     def __str__(self) -> str:
         """Return a line: the episode, and what it gives if that is something else."""
         own, again = (
-            f"{'success' if won else 'failure'} at {far:.4f} m" for won, far in self._outcomes
+            f"{'success' if won else 'failure'} at {distance:.4f} m"
+            for won, distance in (self._outcome, self.again)
         )
         where = f"{self.robot.side} robot {self.robot.robot}, episode {self.number}"
         return f"{where}: {own}: {'agrees' if self.agrees else f'DIFFERS: again {again}'}"
@@ -391,28 +395,49 @@ def replay_submission(
     checkpoint: Path | None = None,
     library: tuple[Path, ...] = (),
 ) -> Iterator[ReplayedEpisode]:
-    """Run the evaluation of a submission again, and yield random episodes of both."""
+    """Run random episodes of a submission again, alone if their controller allows it.
+
+    If one ends otherwise, the whole evaluation is run: a batch of one rounds otherwise than that of
+    the evaluation, which a policy may amplify.
+    """
     rules = protocol_from(submission.evaluation, where)
     config = EvalConfig(rules.episodes, rules.simulator, rules.seed, 1, tuple(rules.goals.tasks))
     pairs = [(robot, i) for robot in submission.robots for i in range(len(robot.score))]
     rng = np.random.default_rng(seed)
     picked = sorted(rng.choice(len(pairs), min(count, len(pairs)), replace=False).tolist())
     source = split_source(split, goal_seed=rules.goals.seed, library=library)
+    mode = submission.mode or "deterministic"
+    run_alone: Callable[..., list[Episode]] | None = None
+    if checkpoint is None and not submission.mode:
+        run_whole = partial(evaluate_baseline, submission.method, config=config)
+        baseline = BASELINES[submission.method]
+        if baseline.is_independent:
+            controller, tasks = baseline.make(config.seed), baseline.tasks
+            run_alone = partial(episodes_alone, controller, Interface(), tasks=tasks)
+    else:
+        files = list(checkpoint_files(checkpoint_path(checkpoint or submission.method)))
+        run_whole = partial(evaluate_checkpoints, files, config=config, mode=mode)
+        if len(files) == 1 and mode == "deterministic":
+            run, learner = read_checkpoint(files[0])
+            policy = PolicyController(Policy(learner, mode, config.seed))
+            run_alone = partial(episodes_alone, policy, run.interface)
     for side in SIDES:
         own = [pairs[i] for i in picked if pairs[i][0].side == side]
-        if not own:
-            continue
-        if checkpoint is None and not submission.mode:
-            scores = evaluate_baseline(submission.method, replace(source, side=side), config)
-        else:
-            files = list(checkpoint_files(checkpoint_path(checkpoint or submission.method)))
-            mode = submission.mode or "deterministic"
-            scores = evaluate_checkpoints(files, replace(source, side=side), config, mode)
-        again = {score.robot: score.outcomes for score in scores}
+        of_side = replace(source, side=side)
+        if run_alone and own:
+            chosen = [(robot.robot, number) for robot, number in own]
+            episodes = run_alone(of_side, config, chosen)
+            again = [(each.success, each.distance) for each in episodes]
+            found = list(map(ReplayedEpisode, *zip(*own, strict=True), again))
+            if all(each.agrees for each in found):
+                yield from found
+                continue
+        outcomes = {score.robot: score.outcomes for score in run_whole(of_side)} if own else {}
         for robot, number in own:
-            if len(robot.score) != len(again[robot.robot].score):
+            whole = outcomes[robot.robot]
+            if len(robot.score) != len(whole.score):
                 raise BenchmarkError(
                     f"{where}: {side} robot {robot.robot}: {len(robot.score)} episodes; its "
-                    f"evaluation has {len(again[robot.robot].score)}"
+                    f"evaluation has {len(whole.score)}"
                 )
-            yield ReplayedEpisode(robot, number, again[robot.robot])
+            yield ReplayedEpisode(robot, number, (whole.success[number], whole.distance[number]))
