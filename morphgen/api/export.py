@@ -14,9 +14,7 @@ from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 
 from morphgen.api.checks import bundle_of
-from morphgen.checks.srdf import (
-    robot_srdf_text,
-)
+from morphgen.checks.srdf import curobo_text, robot_srdf_text
 from morphgen.errors import (
     FormatError,
     explain_missing_extras,
@@ -70,7 +68,7 @@ def export(
     Args:
         robot: The robot, its bundle's folder, a description, or words of ``compose``.
         format: A file: ``html``, ``mp4``, ``gif``, ``glb`` or ``srdf``; or a folder: ``urdf``,
-            ``mjcf``, ``sdf``, ``usd`` or ``ros2``.
+            ``mjcf``, ``sdf``, ``curobo``, ``usd`` or ``ros2``.
         out: Output folder; by default the robot's bundle for a file, its parent for a folder, and
             the current folder for other robots.
         dark: Whether an ``html`` page is dark.
@@ -171,6 +169,11 @@ def _meshed(robot: Robot, folder: Path, given: SimpleNamespace) -> None:
     _with_meshes(robot, folder, given.format)
 
 
+def _curobo(robot: Robot, folder: Path, given: SimpleNamespace) -> None:
+    (folder / "robot.yml").write_text(curobo_text(robot, URDF), encoding="utf-8")
+    _with_meshes(robot, folder, "urdf")
+
+
 def _usd(robot: Robot, folder: Path, given: SimpleNamespace) -> None:
     with TemporaryDirectory() as scratch:
         _with_meshes(robot, Path(scratch), "urdf")
@@ -203,6 +206,7 @@ FOLDERS: Mapping[str, Callable[[Robot, Path, SimpleNamespace], None]] = {
     "urdf": _meshed,
     "mjcf": _meshed,
     "sdf": _meshed,
+    "curobo": _curobo,
     "usd": _usd,
     "ros2": _ros2,
 }

@@ -1,8 +1,11 @@
-"""Read and write SRDF, MoveIt's description beside a URDF: groups, and pairs that need no test."""
+"""Read and write SRDF, MoveIt's description beside a URDF: groups, and pairs that need no test.
+
+cuRobo's configuration has the same pairs and spheres.
+"""
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -10,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import yaml
 from lxml import etree
 
 from morphgen.checks.self_collision import ALWAYS_SHARE, SelfCollisionChecker, adjacent_pairs
@@ -19,6 +23,7 @@ from morphgen.formats.xml import parse_xml, read_schema
 from morphgen.model.geometry import Sphere
 from morphgen.model.kinematics import random_configurations
 from morphgen.model.robot import TOOL, Frame, Pair, Robot, sorted_pair
+from morphgen.model.rotation import Vec3
 from morphgen.model.tree import below
 
 MATRIX_SAMPLES = 10_000  # number of sampled configurations, the default of MoveIt's setup assistant
@@ -76,29 +81,83 @@ def robot_srdf_text(robot: Robot, samples: int = MATRIX_SAMPLES) -> str:
     robot with several limbs are named after them, such as ``left_arm``. Links that collide as
     spheres alone have them as a ``link_sphere_approximation``.
     """
+    _require_tool(robot)
+    reasons = collision_matrix(robot, samples)
+    root = etree.Element("robot", name=robot.name)
+    _write_limbs(root, robot, [*_limbs(robot)])
+    for link, balls in _link_spheres(robot).items():
+        element = etree.SubElement(root, "link_sphere_approximation", link=link)
+        for center, radius in balls:
+            values = {"center": _numbers(*center), "radius": _numbers(radius)}
+            etree.SubElement(element, "sphere", values)
+    for (a, b), reason in reasons.items():
+        etree.SubElement(root, "disable_collisions", link1=a, link2=b, reason=reason)
+    etree.indent(root)
+    return etree.tostring(root, encoding="unicode") + "\n"
+
+
+def curobo_text(robot: Robot, urdf: str, samples: int = MATRIX_SAMPLES) -> str:
+    """Return a robot's configuration for cuRobo (format version 2.0) as YAML, beside its URDF."""
+    _require_tool(robot)
+    spheres = _link_spheres(robot)
+    if not spheres or any(link.collisions and link.name not in spheres for link in robot.links):
+        raise FormatError(
+            f"robot {robot.name!r} collides with other shapes than spheres, or not at all; fit "
+            "them first (morphgen fit ROBOT --spheres N --out DIR), and export DIR"
+        )
+    # "tool" of a robot with several limbs is the tool of the last one.
+    names = (frame.name for frame in robot.frames)
+    tools = [name for name in names if name.endswith(f"_{TOOL}")] or [TOOL]
+    joints = [robot.joints[k].name for k in robot.independent_joints]
+    ignore = defaultdict(list)
+    for a, b in collision_matrix(robot, samples):
+        if a in spheres and b in spheres:
+            ignore[a].append(b)
+    kinematics = {
+        "format_version": 2.0,
+        "urdf_path": urdf,
+        "asset_root_path": "",
+        "base_link": robot.root.name,
+        "tool_frames": tools,
+        "collision_link_names": list(spheres),
+        "collision_spheres": {
+            link: [{"center": list(center), "radius": radius} for center, radius in balls]
+            for link, balls in spheres.items()
+        },
+        "collision_sphere_buffer": 0.0,
+        "self_collision_ignore": dict(ignore),
+        "self_collision_buffer": dict.fromkeys(spheres, 0.0),
+        "mesh_link_names": [link.name for link in robot.links if link.visuals],
+        "cspace": {
+            "joint_names": joints,
+            "default_joint_position": list(robot.home),
+            "null_space_weight": [1.0] * len(joints),
+            "cspace_distance_weight": [1.0] * len(joints),
+        },
+    }
+    data = {"robot_cfg": {"kinematics": kinematics}}
+    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
+
+
+def _require_tool(robot: Robot) -> None:
     if robot.tool is None:
         raise FormatError(
             f"robot {robot.name!r} has no frame {TOOL!r}, where its arm ends; import it with a "
             "tool (morphgen import FILE --tool LINK)"
         )
-    reasons = collision_matrix(robot, samples)
-    root = etree.Element("robot", name=robot.name)
-    _write_limbs(root, robot, [*_limbs(robot)])
-    for link in robot.links:
-        balls = [
+
+
+def _link_spheres(robot: Robot) -> dict[str, list[tuple[Vec3, float]]]:
+    """Return centres and radii [m] of the links that collide as spheres alone, by link name."""
+    return {
+        link.name: [
             (shape.T_link_shape.position, shape.geometry.radius)
             for shape in link.collisions
             if isinstance(shape.geometry, Sphere)
         ]
-        if balls and len(balls) == len(link.collisions):
-            element = etree.SubElement(root, "link_sphere_approximation", link=link.name)
-            for center, radius in balls:
-                values = {"center": _numbers(*center), "radius": _numbers(radius)}
-                etree.SubElement(element, "sphere", values)
-    for (a, b), reason in reasons.items():
-        etree.SubElement(root, "disable_collisions", link1=a, link2=b, reason=reason)
-    etree.indent(root)
-    return etree.tostring(root, encoding="unicode") + "\n"
+        for link in robot.links
+        if link.collisions and all(isinstance(each.geometry, Sphere) for each in link.collisions)
+    }
 
 
 def _write_limbs(root: etree._Element, robot: Robot, limbs: Sequence[_Limb]) -> None:

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
+import yaml
 
 from helpers.parts import write_part
 from helpers.robots import arm
@@ -166,7 +167,7 @@ def test_fit_writes_a_bundle_whose_urdf_and_mjcf_have_spheres_alone(ok, balls, t
 def test_exports_have_the_spheres_of_the_robot(ok, balls, tmp_path):
     words = ("--spheres", "2", "--cover", "0.9", "--out", "round", "--no-picture")
     ok("fit", balls, *words)
-    for name in ("urdf", "srdf"):
+    for name in ("urdf", "srdf", "curobo"):
         ok("export", "round", "--format", name, "--out", tmp_path)
     expected = spheres_of(read_urdf(tmp_path / "round-urdf" / "robot.urdf", written_frames=True))
     assert {link: len(of_link) for link, of_link in expected.items()} == counts(2)
@@ -178,3 +179,10 @@ def test_exports_have_the_spheres_of_the_robot(ok, balls, tmp_path):
         for link in srdf.iterfind("link_sphere_approximation")
     }
     assert read == {link: spheres for link, spheres in expected.items() if spheres}
+    folder = tmp_path / "round-curobo"
+    kinematics = yaml.safe_load((folder / "robot.yml").read_text())["robot_cfg"]["kinematics"]
+    assert expected == {
+        link: [(*s["center"], s["radius"]) for s in spheres]
+        for link, spheres in kinematics["collision_spheres"].items()
+    }
+    assert spheres_of(read_urdf(folder / kinematics["urdf_path"], written_frames=True)) == expected

@@ -1,4 +1,4 @@
-"""SDF, SRDF, glTF and packages for ROS 2."""
+"""SDF, SRDF, cuRobo, glTF and packages for ROS 2."""
 
 import io
 import json
@@ -18,6 +18,8 @@ from scipy.spatial.transform import Rotation
 from helpers.faulty_robots import valid_robot_with_mesh
 from helpers.robots import arm
 from morphgen.checks.srdf import (
+    collision_matrix,
+    curobo_text,
     disabled_link_pairs,
     parse_srdf,
     with_disabled_pairs,
@@ -33,7 +35,7 @@ from morphgen.formats.exchange import (
 )
 from morphgen.formats.resolve import default_finder
 from morphgen.formats.urdf.read import read_urdf
-from morphgen.model.geometry import Box, Capsule, Pose, Shape
+from morphgen.model.geometry import Box, Capsule, Pose, Shape, Sphere
 from morphgen.model.inertia import solid_mesh
 from morphgen.model.kinematics import forward_kinematics
 from morphgen.model.robot import Frame, Joint, Link, Robot
@@ -200,6 +202,83 @@ def test_disabled_pairs_become_ignored_ones():
 def test_unchecked_links_collide_only_in_enabled_pairs():
     root = parse_srdf(document(FOREIGN), "x")
     assert disabled_link_pairs(root, ("a", "b", "c", "d")) == (("a", "b"), ("b", "c"), ("c", "d"))
+
+
+KINEMATICS = {
+    **dict.fromkeys(("format_version", "collision_sphere_buffer"), float),
+    **dict.fromkeys(("urdf_path", "asset_root_path", "base_link"), str),
+    **dict.fromkeys(("tool_frames", "collision_link_names", "mesh_link_names"), list),
+    **dict.fromkeys(("collision_spheres", "self_collision_ignore"), dict),
+    **dict.fromkeys(("self_collision_buffer", "cspace"), dict),
+}
+"""Fields of cuRobo's ``KinematicsLoaderCfg`` that are written, with their types."""
+CSPACE = {"joint_names", "default_joint_position", "null_space_weight", "cspace_distance_weight"}
+"""Fields of its ``CSpaceParams`` that are written."""
+
+
+def with_balls(robot):
+    """Return the robot with two spheres on every link but the last, which has no shapes."""
+    balls = (
+        Shape(Sphere(0.05), Pose((1e-5, -0.02, 0.123456789))),
+        Shape(Sphere(0.025), Pose((0.0, 0.0, 0.2))),
+    )
+    links = [replace(link, collisions=balls) for link in robot.links[:-1]]
+    return robot.with_links([*links, replace(robot.links[-1], collisions=())])
+
+
+def curobo(robot):
+    data = yaml.safe_load(curobo_text(robot, "robot.urdf", samples=10))
+    assert {key: list(value) for key, value in data.items()} == {"robot_cfg": ["kinematics"]}
+    return data["robot_cfg"]["kinematics"]
+
+
+def test_all_keys_are_those_of_curobo_with_their_types():
+    kinematics = curobo(with_balls(arm()))
+    assert {name: type(value) for name, value in kinematics.items()} == KINEMATICS
+    assert kinematics["format_version"] == 2.0
+    assert set(kinematics["cspace"]) == CSPACE
+
+
+def test_spheres_joints_and_pairs_of_curobo_are_those_of_the_robot():
+    # The last link has no spheres and needs no pair.
+    robot = replace(with_balls(arm()), ignore_pairs=(("base", "left"), ("left", "right")))
+    kinematics = curobo(robot)
+    names = ["base", "upper", "lower", "slider", "left"]
+    assert kinematics["collision_link_names"] == names
+    assert list(kinematics["self_collision_buffer"]) == names
+    spheres = [
+        {"center": [1e-5, -0.02, 0.123456789], "radius": 0.05},
+        {"center": [0.0, 0.0, 0.2], "radius": 0.025},
+    ]
+    assert kinematics["collision_spheres"] == dict.fromkeys(names, spheres)
+    pairs = {(a, b) for a, others in kinematics["self_collision_ignore"].items() for b in others}
+    assert pairs == set(collision_matrix(robot, samples=10)) - {("left", "right")}
+    assert pairs > {("base", "left"), ("base", "upper")}
+    assert kinematics["base_link"] == "base"
+    assert kinematics["tool_frames"] == ["tool"]
+    cspace = kinematics["cspace"]
+    assert cspace["joint_names"] == ["shoulder", "elbow", "extend", "left"]
+    assert cspace["default_joint_position"] == [0.4, 0.5, 0.01, 0.02]
+    assert {len(values) for values in cspace.values()} == {4}
+
+
+def test_every_tool_of_several_limbs_is_a_tool_frame_of_curobo():
+    frames = (Frame("left_tool", "left"), Frame("right_tool", "right"), Frame("tool", "right"))
+    assert curobo(with_balls(replace(arm(), frames=frames)))["tool_frames"] == [
+        "left_tool",
+        "right_tool",
+    ]
+
+
+def test_robots_without_tool_or_with_other_shapes_than_spheres_are_no_robots_of_curobo():
+    robot = with_balls(arm())
+    with pytest.raises(FormatError, match="no frame 'tool', where its arm ends"):
+        curobo(replace(robot, frames=()))
+    mixed = (*robot.links[0].collisions, Shape(Box((0.1, 0.1, 0.1))))
+    bare = [replace(link, collisions=()) for link in robot.links]
+    for links in (bare, [replace(robot.links[0], collisions=mixed), *robot.links[1:]]):
+        with pytest.raises(FormatError, match=r"fit ROBOT --spheres N --out DIR"):
+            curobo(robot.with_links(links))
 
 
 def loaded(robot):
