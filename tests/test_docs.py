@@ -47,6 +47,32 @@ _MJCF = """<mujoco model="{name}"><worldbody>
     </body>
   </body>
 </worldbody></mujoco>"""
+_LINK = """<link name="{}"><inertial><mass value="1"/>
+    <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><sphere radius="0.05"/></geometry></collision></link>"""
+_DESCRIPTION = f"""<robot name="z1_description">{_LINK.format("link00")}{_LINK.format("link06")}
+  <joint name="j" type="revolute"><parent link="link00"/><child link="link06"/>
+    <origin xyz="0 0 0.3"/><axis xyz="0 0 1"/>
+    <limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
+
+
+def add_outside_robots(folder, monkeypatch):
+    """Write the robots below a folder, and let the collections find them there."""
+    packages = folder / "outside" / "packages"
+    collection = packages / "robot_descriptions"
+    lengths = {
+        collection / "ur5e.xml": 0.3,
+        **{folder / "bodies" / f"body_{i}.xml": 0.2 + 0.02 * i for i in range(1, 23)},
+    }
+    for path, length in lengths.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(_MJCF.format(name=path.stem, length=length))
+    (collection / "z1.urdf").write_text(_DESCRIPTION)
+    (collection / "__init__.py").touch()
+    (collection / "z1_description.py").write_text(f"URDF_PATH = {str(collection / 'z1.urdf')!r}\n")
+    mjcf = f"MJCF_PATH = {str(collection / 'ur5e.xml')!r}\n"
+    (collection / "ur5e_mj_description.py").write_text(mjcf)
+    monkeypatch.syspath_prepend(str(packages))
 
 
 def codes_in_source():
@@ -152,10 +178,7 @@ def test_pages_work_from_top_to_bottom(name, tmp_path, monkeypatch, capsys):
     """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    (tmp_path / "bodies").mkdir()
-    for i in range(1, 23):
-        text = _MJCF.format(name=f"body_{i}", length=0.2 + 0.02 * i)
-        (tmp_path / "bodies" / f"body_{i}.xml").write_text(text)
+    add_outside_robots(tmp_path, monkeypatch)
     simulator, _, *defaults = EvalProtocol.__init__.__defaults__
     monkeypatch.setattr(EvalProtocol.__init__, "__defaults__", (simulator, 2, *defaults))
     _, _, text = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8").partition("\n## ")

@@ -12,7 +12,7 @@ from morphgen.checks import check
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, status
 from morphgen.errors import CompositionError, FormatError
-from morphgen.formats.bundle import CARD, URDF, bundle_folder, write_bundle
+from morphgen.formats.bundle import CARD, URDF, bundle_folder, find_description, write_bundle
 from morphgen.formats.data_files import read_json
 from morphgen.grammar.compose import compose as compose_parts
 from morphgen.grammar.part import part_manifest, write_part
@@ -157,10 +157,11 @@ def import_robot(args: argparse.Namespace) -> int:
         )
     if args.part and not args.licence:
         raise FormatError("--part: name the robot's licence by --licence, such as MIT")
-    with status(args, f"importing {args.file}"):
+    path, own_args = find_description(args.file)
+    with status(args, f"importing {path}"):
         robot = robot_source.import_robot(
-            args.file,
-            _xacro_args(args.arg),
+            path,
+            {**own_args, **_xacro_args(args.arg)},
             root=args.root,
             root_link=args.root_link,
             tool=args.tool,
@@ -170,9 +171,9 @@ def import_robot(args: argparse.Namespace) -> int:
             skip_missing_meshes=args.skip_missing_meshes,
         )
     folder = bundle_folder(args.out, robot.name)
-    if args.file.resolve().is_relative_to(folder.resolve()):
+    if path.resolve().is_relative_to(folder.resolve()):
         raise FormatError(
-            f"{args.file}: its bundle would replace {folder}, the folder that it is in; "
+            f"{path}: its bundle would replace {folder}, the folder that it is in; "
             "choose another --name or --out"
         )
     part = None
@@ -181,8 +182,8 @@ def import_robot(args: argparse.Namespace) -> int:
     data, text, code = write_checked(robot, args)
     if part is not None:
         write_part(*part)
-        path = str(part[0])
-        data, text = {**data, "part": path}, f"{text}\n{path}"
+        manifest = str(part[0])
+        data, text = {**data, "part": manifest}, f"{text}\n{manifest}"
     opt.print_result(args, data, lambda: text)
     return code
 

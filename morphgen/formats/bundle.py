@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import json
+import pkgutil
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from functools import partial
+from importlib import import_module
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from msgspec import field
 
-from morphgen.errors import FormatError, one_line
+from morphgen.errors import FormatError, nearest, one_line
 from morphgen.files import file_sha256
 from morphgen.formats import resolve
 from morphgen.formats.data_files import kept_reading, read_json
@@ -416,3 +419,31 @@ def is_mjcf(path: Path) -> bool:
         return False
     with path.open("rb") as file:
         return root_tag(file.read(_MAX_HEAD)) == "mujoco"
+
+
+DESCRIPTIONS = "robot_descriptions"  # module of the pip package, and prefix of its robots
+_PATHS = ("MJCF_PATH", "URDF_PATH", "XACRO_PATH")
+"""Names of the paths in a module of ``robot_descriptions``; the first one that exists is taken."""
+
+
+def find_description(text: str) -> tuple[Path, dict[str, str]]:
+    """Return the file that a path or ``robot_descriptions:NAME`` names, and its xacro arguments."""
+    collection, colon, name = text.partition(":")
+    if not colon or collection != DESCRIPTIONS:
+        return Path(text), {}
+    spec = find_spec(DESCRIPTIONS)
+    if spec is None:
+        raise FormatError(f"{text}: pip install {DESCRIPTIONS}, which has its robots")
+    modules = pkgutil.iter_modules(spec.submodule_search_locations)
+    names = [module.name for module in modules if module.name.endswith("_description")]
+    if name not in names:
+        raise FormatError(f"{text}: no such robot{nearest(name, names)}")
+    try:
+        module = import_module(f"{DESCRIPTIONS}.{name}")
+    except Exception as error:  # whatever the package's download raises, such as GitCommandError
+        raise FormatError(f"{text}: cannot be loaded: {error}") from error
+    for key in _PATHS:
+        if path := getattr(module, key, None):
+            args = getattr(module, "XACRO_ARGS", {}) if key == "XACRO_PATH" else {}
+            return Path(path), {name: str(args[name]) for name in args}
+    raise FormatError(f"{text}: the module has none of {', '.join(_PATHS)}")

@@ -1,10 +1,14 @@
-"""Imported robots become parts."""
+"""Imported robots become parts; robots of collections are imported."""
+
+import sys
+from pathlib import Path
 
 import pytest
 
 import morphgen
 from helpers.commands import tree
 from helpers.mjcf import write
+from morphgen.formats.bundle import find_description
 
 SITE = '<site name="tool" pos="0 0 0.2" euler="0 90 0"/>'
 ARM = f"""<worldbody>
@@ -73,3 +77,27 @@ def test_bodies_become_parts_of_a_split(ok, tmp_path):
     words = ("--library", "parts", "--train", "1", "--test", "1", "--name", "my/set")
     ok("split", "new", "--grammar", "set.grammar", "--hold-out", "body=body_2", *words)
     assert "body_2" in (tmp_path / "my" / "set.yaml").read_text()
+
+
+def test_a_module_of_robot_descriptions_names_its_file(refused, tmp_path, monkeypatch):
+    folder = tmp_path / "packages" / "robot_descriptions"
+    folder.mkdir(parents=True)
+    (folder / "__init__.py").touch()
+    (folder / "toy_description.py").write_text(
+        "XACRO_PATH = '/toys/toy.xacro'\nXACRO_ARGS = {'length': 2}\n"
+    )
+    (folder / "lost_description.py").write_text("raise OSError('no network')\n")
+    monkeypatch.syspath_prepend(str(tmp_path / "packages"))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # nothing else may be written
+    for module in ("", ".toy_description", ".lost_description"):
+        # Set first, so that what the test imports goes with it.
+        monkeypatch.setitem(sys.modules, f"robot_descriptions{module}", None)
+        monkeypatch.delitem(sys.modules, f"robot_descriptions{module}")
+    found = find_description("robot_descriptions:toy_description")
+    assert found == (Path("/toys/toy.xacro"), {"length": "2"})
+    for name, reason in (
+        ("toi_description", "no such robot; did you mean 'toy_description'?"),
+        ("lost_description", "lost_description: cannot be loaded: no network"),
+    ):
+        assert reason in refused("import", f"robot_descriptions:{name}")
+    assert find_description("C:robot.xml") == (Path("C:robot.xml"), {})
