@@ -183,9 +183,8 @@ def test_episodes_of_a_submission_are_run_again(run, refused, small, monkeypatch
     assert run(*words)[0] == 0
     score = ("split", "score", "a.json", "--split", archive, "--replay", "2")
     with monkeypatch.context() as patch:
-        patch.setattr(
-            study, "evaluate_baseline", pytest.fail
-        )  # what agrees alone needs no whole evaluation
+        # What agrees alone needs no whole evaluation.
+        patch.setattr(study, "evaluate_baseline", pytest.fail)
         code, out, _ = run(*score)
     assert (code, out.count(": agrees\n")) == (0, 2)
     values = json.loads(Path("a.json").read_text())
