@@ -8,6 +8,7 @@ precision: all of its formulas are those of the batch, for arrays of NumPy.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from inspect import currentframe
 from typing import Any, cast
 
 import gymnasium as gym
@@ -35,6 +36,7 @@ from morphgen.tasks.observation import LinkJoints, LinkTokens, Observation
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.renderer import SIZE, Frame, Renderer, render_state
 from morphgen.tasks.rows import numpy_row
+from morphgen.tasks.scenes.env_specs import GoalConfig
 from morphgen.tasks.scenes.make import make_batch
 from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.tasks.task import STANDARD_FIELDS, StepFormulas, StepResult, TaskConfig
@@ -211,6 +213,7 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         self._size, self.render_mode = render_arguments(render_mode, size), render_mode
         self._renderer: Renderer | None = None
         options = batch_options("one environment", task, config, options, _OPTIONS)
+        _require_limit(GoalConfig(tasks=options.get("configs", ())).task_config(task))
         self.task = task
         batch = make_batch(task, [robot], 1, **options)
         self._wrap(batch)
@@ -286,3 +289,16 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
             for name, values in numpy_observation(observation).items()
             if values.dtype == np.float32 and name not in self._hidden
         }
+
+
+def _require_limit(config: TaskConfig) -> None:
+    """Refuse a ``max_episode_steps`` of ``gym.make`` before which all episodes end."""
+    frame = currentframe()  # gym.make gives the number to a wrapper alone
+    while frame is not None and frame.f_code is not gym.make.__code__:
+        frame = frame.f_back
+    given = None if frame is None else frame.f_locals.get("max_episode_steps")
+    if isinstance(given, int) and given > config.max_episode_steps:
+        raise TaskError(
+            f"max_episode_steps {given}: episodes end after {config.max_episode_steps} control "
+            f"steps; for longer ones pass a config of the task with max_episode_steps={given}"
+        )

@@ -173,6 +173,11 @@ def test_time_limit(name, config):
         env.reset(seed=0)
         ends = [env.step(np.zeros(env.action_space.shape, np.float32))[3] for _ in range(3)]
         assert ends == [False, False, True]
+    make(name, **given, max_episode_steps=STEPS).close()
+    sync = partial(gym.make_vec, vectorization_mode="sync", robot="arm3-stick")
+    for make_any in (make, sync):
+        with pytest.raises(TaskError, match=f"max_episode_steps {STEPS + 1}: episodes end after"):
+            make_any(name, **given, max_episode_steps=STEPS + 1)
     with closing(make_vec(name, **given)) as envs:
         assert envs.max_episode_steps == envs.spec.max_episode_steps == STEPS
     with pytest.raises(TaskError, match="unknown option 'max_episode_steps'"):
