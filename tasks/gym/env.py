@@ -161,7 +161,7 @@ def render_arguments(render_mode: str | None, size: tuple[int, int]) -> tuple[in
     return width, height
 
 
-_OPTIONS = OPTIONS - {"workers", "device", "seed", "first", "configs"}
+_OPTIONS = OPTIONS - {"workers", "device", "seed", "first", "configs"} | {"render_mode", "size"}
 
 
 class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):

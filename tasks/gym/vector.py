@@ -88,7 +88,7 @@ def batch_options(
     """Return keyword arguments of ``make_batch``: options, and a ``config``, also as in JSON."""
     for name in options:
         if name not in valid:
-            hint = nearest(name, valid | {"config", "render_mode", "robot", "size"})
+            hint = nearest(name, valid | {"config", "robot"})
             raise TaskError(f"{what}: unknown option {name!r}{hint}")
     given = dict(options)
     kind = TASKS[task].config_type

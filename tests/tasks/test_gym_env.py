@@ -261,7 +261,7 @@ def test_options_of_reset_are_refused():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: task_vector(1, task="reach", robto="x"), "'robto'; did you mean 'robot"),
+        (lambda: task_vector(1, task="reach", size=4), "'size'; .*: cache, .*robot, seed, sim, w"),
         (lambda: make(render_mode="rgb"), "'rgb'; expected rgb_array"),
         (lambda: make(size=4), r"size 4: expected width and height \[pixels\]"),
         (lambda: make(observe={"velocity": True}), "'velocity': True}: expected an ObservationCo"),
