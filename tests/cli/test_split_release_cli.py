@@ -179,8 +179,7 @@ def test_episodes_of_a_submission_are_run_again(run, refused, small, monkeypatch
     run(*RELEASE, small, *few, "--no-goals")
     archive = "releases/mine-small-1.0.0.zip"
     shutil.unpack_archive(archive, ".")
-    words = ("eval", "zero", "--split", "mine-small-1.0.0", *few, "--submission", "a.json")
-    assert run(*words)[0] == 0
+    run("eval", "zero", "--split", "mine-small-1.0.0", *few, "--submission", "a.json")
     score = ("split", "score", "a.json", "--split", archive, "--replay", "2")
     with monkeypatch.context() as patch:
         # What agrees alone needs no whole evaluation.
@@ -195,8 +194,10 @@ def test_episodes_of_a_submission_are_run_again(run, refused, small, monkeypatch
     code, out, _ = run(*score, "--seed", "3")
     assert code == 1
     assert len(re.findall(r"a\.json: \w+ robot \S+, episode [01]: .*: DIFFERS: again ", out)) == 2
-    Path("a.json").write_text(json.dumps(values | {"method": "mine"}))
-    assert "a.json; expected one with --checkpoint RUN" in refused(*score)
+    errors = {"mine": "expected one with --checkpoint RUN", "scripted": " for reach"}
+    for method, error in errors.items():
+        Path("a.json").write_text(json.dumps(values | {"method": method}))
+        assert error in refused(*score)
 
 
 @pytest.mark.slow

@@ -411,6 +411,10 @@ def replay_submission(
     if checkpoint is None and not submission.mode:
         run_whole = partial(evaluate_baseline, submission.method, config=config)
         baseline = BASELINES[submission.method]
+        unfit = [each for each in submission.robots if not baseline.suits([each.task])]
+        if unfit:
+            each = f"{where}: {unfit[0].side} robot {unfit[0].robot}"
+            raise BenchmarkError(f"{each}: {submission.method} is not for {unfit[0].task}")
         if baseline.is_independent:
             controller, tasks = baseline.make(config.seed), baseline.tasks
             run_alone = partial(episodes_alone, controller, Interface(), tasks=tasks)
