@@ -104,13 +104,14 @@ def sample_split_goals(
     *,
     jobs: int = 1,
     certified: bool = False,
+    cache: Path | None = None,
 ) -> list[GoalResult]:
     """Sample the goal sets of all members, train first, or take them from the cache.
 
     A robot without a goal set does not stop the others. An interrupted run continues from the sets
     in the cache.
     """
-    sample = partial(_sample_member, library, config, certified)
+    sample = partial(_sample_member, library, config, certified, cache)
     return list(parallel_map(sample, sided_members(split), jobs, chunk=1))
 
 
@@ -118,6 +119,7 @@ def _sample_member(
     library: Library,
     config: GoalConfig | None,
     certified: bool,
+    cache: Path | None,
     sided_member: tuple[Side, Member],
 ) -> GoalResult:
     """Sample the goal set of a member, in a worker process."""
@@ -127,7 +129,9 @@ def _sample_member(
         robot = member_with_primitives(member, library)
     except MorphgenError as error:
         return GoalResult(member.name, side, task, obstacles, error=str(error))
-    result = sample_robot_goals(robot, task, config, obstacles=obstacles, certified=certified)
+    result = sample_robot_goals(
+        robot, task, config, obstacles=obstacles, certified=certified, cache=cache
+    )
     return replace(result, side=side)
 
 
