@@ -141,7 +141,9 @@ def record(
 
 def _sources(given: SimpleNamespace) -> tuple[Source, ...]:
     if (given.robots is None) == (given.drawn is None):
-        raise TaskError("expected either robots, as of a split, or grammars to draw robots from")
+        raise TaskError(
+            "expected either a split or a robot, or grammars to draw robots from (--robots)"
+        )
     for task in given.tasks:
         TASKS[task]  # raises if the task is unknown
     if given.drawn is not None:

@@ -51,7 +51,7 @@ from morphgen.rl.runs import robot_source
 from morphgen.rl.runs.checkpoint import RunConfig, read_checkpoint, read_config
 from morphgen.rl.runs.training import checkpoint_files
 from morphgen.rl.scores import Evaluation, Score
-from morphgen.rl.shipped_policies import checkpoint_path, is_named
+from morphgen.rl.shipped_policies import POLICIES, checkpoint_path, is_named
 from morphgen.splits.split import Side, require_side
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, require_device
 from morphgen.tasks.renderer import require_video_path, write_video
@@ -284,6 +284,9 @@ def _policy_scores(given: SimpleNamespace) -> dict[str, list[Score]]:
     require_device(given.device)
     name = str(given.policy)
     path = checkpoint_path(name)
+    if path.name == name and not path.exists():  # as likely a slip in the name of a policy
+        hint = nearest(name, (*BASELINES, *POLICIES))
+        raise TaskError(f"{name}: no checkpoint, and no folder of a run with one{hint}")
     files = list(checkpoint_files(path))
     for file in files:
         run, learner = read_checkpoint(file)
