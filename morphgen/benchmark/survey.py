@@ -215,7 +215,7 @@ MEASURED = ("mass", "reach")
 def statistics(split: Split, library: Library, *, jobs: int = 1) -> dict[str, object]:
     """Compute sizes of the robots of a split, and the similarity of test and train robots.
 
-    Files of splits contain them.
+    The files of the splits that come with morphgen contain them.
     """
     survey = survey_split(split, library, jobs=jobs)
     return {

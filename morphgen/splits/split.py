@@ -414,13 +414,13 @@ class DerivedRecipe:
 Recipe = SampledRecipe | DerivedRecipe
 
 
-def recipe_of(words: Sequence[str], library: Library, name: str = "") -> DerivedRecipe:
+def recipe_of(words: Sequence[str], library: Library) -> DerivedRecipe:
     """Return the recipe for the arguments of ``morphgen compose``, which also give a name."""
-    derivation, default_name = parse_words(words, library)
+    derivation, name = parse_words(words, library)
     # The category is the grammar that the arguments begin with, if they are no parts.
     is_request = "=" in words[0] or (words[0] in library.paths and words[0] not in grammar_names())
     category = COMPOSED if is_request else words[0].rpartition("/")[2].removesuffix(".grammar")
-    return DerivedRecipe(derivation, name or default_name, category)
+    return DerivedRecipe(derivation, name, category)
 
 
 class UnfitRobotError(BenchmarkError):

@@ -72,7 +72,7 @@ def generated(split, side):
         for number in range(row.get("first", 0), row.get("first", 0) + row.get("robots", 1)):
             member = next(stored)
             if "words" in row:
-                recipe = recipe_of(tuple(row["words"].split()), LIBRARY, row["robot"])
+                recipe = replace(recipe_of(row["words"].split(), LIBRARY), name=row["robot"])
             else:
                 loaded = load_grammar(find_grammar(row["grammar"], folders), folders)
                 pinned = pin(loaded, row.get("pinned", "").split(), LIBRARY)
