@@ -15,7 +15,7 @@ from morphgen.benchmark.scores import study as studies
 from morphgen.benchmark.scores.submission import EvalProtocol
 from morphgen.cli import options as opt
 from morphgen.cli.progress import note, status, training_progress
-from morphgen.errors import TaskError, nearest
+from morphgen.errors import TaskError, nearest, shortened
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import OBSERVATION_SWITCHES, SWITCHES, PPOConfig, parse_agent, parse_agents
 from morphgen.rl.evaluation import EvalConfig
@@ -215,14 +215,23 @@ def _splits(word: str) -> tuple[str, ...]:
     return tuple(name for name, used in tasks.items() if used <= {*IN_EVERY_FILE})
 
 
+_SEED_DIGITS = 18  # largest number of digits of a seed: files hold whole numbers below 2^63
+_MAX_SEEDS = 1000  # largest number of seeds of a range
+
+
 def _seeds(text: str) -> list[int]:
     """Read ``0..2`` or ``0,3``."""
     seeds: list[int] = []
     for part in text.split(","):
         first, dots, last = part.partition("..")
-        if not first.isdecimal() or (dots and not last.isdecimal()):
-            raise TaskError(f"--seeds {text}: expected such as 0..2 or 0,3")
-        seeds += range(int(first), int(last or first) + 1)
+        ends = [first, last if dots else first]
+        if not all(end.isdecimal() and len(end) <= _SEED_DIGITS for end in ends):
+            valid = f"such as 0..2 or 0,3, with at most {_SEED_DIGITS} digits"
+            raise TaskError(f"--seeds {shortened(text)}: expected {valid}")
+        low, high = map(int, ends)
+        if high - low >= _MAX_SEEDS:
+            raise TaskError(f"--seeds {text}: expected at most {_MAX_SEEDS} seeds")
+        seeds += range(low, high + 1)
     if not seeds or len(set(seeds)) < len(seeds):
         raise TaskError(f"--seeds {text}: expected at least one seed, and none twice")
     return seeds

@@ -153,7 +153,7 @@ SUBMIT a.json --sim pybullet => expected 'mujoco'
 eval zero --split prims task=reach --submission a.json => prims is no split
 finetune nothing => no checkpoint
 study nothing => nothing: no such file, and no split of this name
-STUDY --seeds 2..x => --seeds 2..x
+STUDY --seeds 0,9223372036854775808 => with at most 18 digits
 STUDY --agents se,se => is there twice
 STUDY --agents me-tf@test => only se
 STUDY --steps 10 => an update takes
