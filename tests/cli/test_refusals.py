@@ -117,7 +117,6 @@ train planar-cube task=dance => unknown task 'dance'; valid: TASKS
 train interpolation/arm3/reach --obstacles => --obstacles is for one robot
 train interpolation/arm3/reach --envs 9 => fewer than the 10 robots
 RUN --steps 1e99 => argument --steps: 1e99: expected at most 2^63 - 1
-RUN --seed 1e99 => argument --seed: 1e99: expected at most 2^63 - 1
 RUN --steps 31 => an update takes 32 transitions
 RUN --device tpu => unknown device 'tpu'
 RUN --agent se+magic => after se come switches
