@@ -142,7 +142,7 @@ def record(
 def _sources(given: SimpleNamespace) -> tuple[Source, ...]:
     if (given.robots is None) == (given.drawn is None):
         raise TaskError(
-            "expected either a split or a robot, or grammars to draw robots from (--robots)"
+            "expected either robots, such as a split, or grammars to draw from (--robots)"
         )
     for task in given.tasks:
         TASKS[task]  # raises if the task is unknown
