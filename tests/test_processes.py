@@ -33,10 +33,7 @@ def test_results_come_in_order(jobs, n):
 
 def test_ray_without_its_package_or_a_cluster_is_an_error(monkeypatch):
     pytest.importorskip("ray")
-    with (
-        pytest.raises(MorphgenError, match=r"no Ray cluster at '127\.0\.0\.1:1': .*refused"),
-        ray_cluster("127.0.0.1:1"),
-    ):
+    with pytest.raises(MorphgenError, match=r"1:1': .*refused"), ray_cluster("127.0.0.1:1"):
         pass
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MorphgenError, match=r"pip install 'morphgen\[ray\]'"):
@@ -44,8 +41,9 @@ def test_ray_without_its_package_or_a_cluster_is_an_error(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_error_of_a_task_of_ray_is_its_cause():
+def test_the_error_of_a_task_of_ray_is_its_cause(monkeypatch):
     ray = pytest.importorskip("ray")
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # of the module helpers
     with pytest.raises(BenchmarkError, match="20 is wrong"), ray_cluster(None):
         ray.get(ray.remote(fail).remote(20))
 
