@@ -18,12 +18,33 @@ from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from morphgen.errors import FormatError
 
+if TYPE_CHECKING:
+    from lxml import etree
+
 T = TypeVar("T")
 _LOGGER = logging.getLogger(__name__)
+
+
+def xml_parser(*, recover: bool = False, huge_tree: bool = False) -> etree.XMLParser:
+    """Return a parser of XML from strangers: it resolves no entity, and loads no other file.
+
+    ``huge_tree`` lifts libxml2's limit on the length of a text.
+    """
+    from lxml import etree  # here, because most users of this module read no XML
+
+    return etree.XMLParser(
+        recover=recover,
+        huge_tree=huge_tree,
+        resolve_entities=False,
+        no_network=True,
+        load_dtd=False,
+        remove_comments=True,
+        remove_pis=True,
+    )
 
 
 def file_stamp(path: Path) -> tuple[int, int]:

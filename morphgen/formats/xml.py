@@ -17,6 +17,7 @@ from lxml import etree
 from msgspec import field
 
 from morphgen.errors import FormatError
+from morphgen.files import xml_parser
 from morphgen.formats.data_files import parse_yaml
 from morphgen.formats.records import Record, read_record
 from morphgen.model.findings import Finding, texts_of
@@ -44,7 +45,7 @@ def parse_xml(data: bytes, origin: str) -> etree._Element:
     bound ("billion laughs") or include other files.
     """
     try:
-        root = etree.fromstring(data, _parser())
+        root = etree.fromstring(data, xml_parser())
     except etree.XMLSyntaxError as error:
         line, column = error.position
         reason = " ".join(_LOCATION.sub("", error.msg or "not XML").split())
@@ -52,17 +53,6 @@ def parse_xml(data: bytes, origin: str) -> etree._Element:
     if root.getroottree().docinfo.internalDTD is not None:
         raise _doctype_error(origin)
     return root
-
-
-def _parser(*, recover: bool = False) -> etree.XMLParser:
-    return etree.XMLParser(
-        recover=recover,
-        resolve_entities=False,
-        no_network=True,
-        load_dtd=False,
-        remove_comments=True,
-        remove_pis=True,
-    )
 
 
 def parse_description(data: bytes, origin: str) -> tuple[etree._Element, tuple[Finding, ...]]:
@@ -163,7 +153,7 @@ def _recovered(text: str, origin: str) -> tuple[etree._Element | None, list[Find
     missing = {"": 0}
     while missing and len(prefixes) <= _MAX_PREFIXES:
         spaces = "".join(f' xmlns:{name}="{_UNDECLARED}{name}"' for name in prefixes)
-        parser = _parser(recover=True)
+        parser = xml_parser(recover=True)
         declared = _ROOT.sub(lambda match: match[0] + spaces, text, count=1)  # noqa: B023
         root: etree._Element | None = etree.fromstring(declared.encode() or b" ", parser)
         errors = [*parser.error_log]

@@ -41,6 +41,7 @@ from PIL import Image, UnidentifiedImageError
 from trimesh.visual import TextureVisuals
 
 from morphgen.errors import MALFORMED, MeshError
+from morphgen.files import xml_parser
 from morphgen.model.geometry import MESH_SUFFIXES, MeshContent, MeshPart, Rgba
 from morphgen.typing import Array
 
@@ -322,16 +323,8 @@ def _collada(data: bytes) -> etree._Element:
         raise ValueError("has a DOCTYPE; a mesh needs none, remove it")
     if data.count(b"<") + data.count(b"=") > _MAX_MARKUP:
         raise ValueError(f"more than {_MAX_MARKUP} elements and attributes")
-    # huge_tree, because coordinate arrays exceed libxml2's default limit on text.
-    parser = etree.XMLParser(
-        resolve_entities=False,
-        no_network=True,
-        load_dtd=False,
-        huge_tree=True,
-        remove_comments=True,
-        remove_pis=True,
-    )
-    return etree.fromstring(data, parser)
+    # Coordinate arrays exceed libxml2's default limit on text.
+    return etree.fromstring(data, xml_parser(huge_tree=True))
 
 
 def _tag(element: etree._Element) -> str:
