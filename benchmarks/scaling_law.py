@@ -58,14 +58,11 @@ from morphgen.splits.split import Split
 from morphgen.tasks.scenes.env_specs import GoalConfig
 from morphgen.tasks.task import TaskConfig
 from morphgen.typing import Array
+from robot_curve import REAL_ARMS, is_trained
 
 GRAMMAR = "serial"
 OTHER_STRUCTURES = "arm3:20,arm5:20,chain:20"
 TEST_SEED = 1_000_000  # seed of the robots to judge on, far from those to train on
-REAL_ARMS = (
-    *("ur5", "panda", "kinova_gen3", "xarm7", "iiwa14"),
-    *("jaco2", "lwr", "widowx", "z1", "ur10"),
-)
 TESTS = {"same grammar": 4, "other structures": 3, "ten real arms": 20}
 """Number of episodes of each robot of a test, which has 50, 60 or 10 robots."""
 NUM_RESAMPLES = 2000
@@ -122,10 +119,8 @@ class Cell:
 def train(cell: Cell, runs: Path, gpu: int) -> Path:
     """Train the policy of a cell, unless that is done, and return its folder."""
     run, task = runs / cell.name, TASKS[cell.task]
-    if (run / CHECKPOINT).is_file():
-        config, learner = read_checkpoint(run)
-        if learner["update"] >= config.num_updates:
-            return run
+    if is_trained(run):
+        return run
     words = (
         *("train", f"task={task.name}", "--robots", f"{GRAMMAR}:{cell.robots}"),
         *("--robot-seed", str(cell.seed), "--seed", str(cell.seed), "--steps", str(task.steps)),

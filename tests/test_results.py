@@ -98,7 +98,8 @@ def test_the_docs_have_the_table_of_the_stored_conformance(monkeypatch, capsys):
     assert capsys.readouterr().out.rstrip() in "\n".join(map(str.rstrip, text.splitlines()))
 
 
-def test_the_law_of_made_failures_is_found():
+def test_the_law_of_made_failures_is_found(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
     fitted = runpy.run_path(str(ROOT / "benchmarks" / "scaling_law.py"))["fitted"]
     robots = np.array([1.0, 3.0, 10.0, 30.0, 100.0])
     failures = np.array([0.1 + 0.6 * robots**-0.5, np.full(5, 0.3), 0.8 * robots**-0.2])
