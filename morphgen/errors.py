@@ -187,6 +187,9 @@ def text_argument(name: str, value: object, error: type[MorphgenError]) -> str:
     raise error(f"{name} {value!r}: expected a text")
 
 
+MAX_WHOLE = 2**63 - 1  # largest whole number that files hold
+
+
 def whole_number(
     name: str, value: object, error: type[MorphgenError], least: int | None = None
 ) -> int:
@@ -206,7 +209,7 @@ def require_types(
         text_argument(name, getattr(given, name), error)
     for name in (each for each in least if getattr(given, each) is not None):
         setattr(given, name, whole_number(name, getattr(given, name), error, least[name]))
-        if getattr(given, name) >= 2**63:  # files could not hold it
+        if getattr(given, name) > MAX_WHOLE:
             raise error(f"{name}: expected at most 2^63 - 1")
 
 

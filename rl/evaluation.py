@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from morphgen.errors import TaskError
+from morphgen.errors import MAX_WHOLE, TaskError
 from morphgen.model.kinematics import reach
 from morphgen.progress import part_of, show_progress, stage
 from morphgen.rl.baselines import BASELINES, ZERO, Controller, baselines_for
@@ -68,7 +68,7 @@ class EvalConfig:
     """Configs of tasks; other tasks have their defaults."""
 
     def __post_init__(self) -> None:
-        if self.episodes < 1 or not 0 <= self.seed < 2**63:
+        if self.episodes < 1 or not 0 <= self.seed <= MAX_WHOLE:
             raise TaskError(
                 f"{self.episodes} episodes, seed {self.seed}: expected at least one episode, and a "
                 "seed from 0 to 2^63 - 1"

@@ -258,7 +258,7 @@ class TaskEnvs(ABC):
     needs_tool_rotation: bool = False
     """Whether the formulas need ``TaskState.tool_rotation``."""
     formulas: StepFormulas[torch.Tensor]
-    """What a step computes; ``TaskEnv`` has the same formulas for one environment in NumPy."""
+    """Functions of the task on tensors; ``TaskEnv`` calls the same ones with arrays of NumPy."""
 
     @abstractmethod
     def begin(

@@ -17,7 +17,7 @@ from pathlib import Path
 from string import Template
 from typing import Any, NoReturn, TypeAlias
 
-from morphgen.errors import MorphgenError, nearest
+from morphgen.errors import MAX_WHOLE, MorphgenError, nearest
 from morphgen.rl.agents import AGENTS, PRESETS
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.shipped_policies import POLICIES
@@ -258,7 +258,7 @@ def whole_number(least: int, largest: int | None = None) -> Callable[[str], int]
         # Nan and inf fail the first condition: their remainder is nan.
         if not (number % 1 == 0 and least <= number <= (math.inf if largest is None else largest)):
             raise argparse.ArgumentTypeError(f"{text}: expected a whole number, {valid}")
-        if number >= 2**63:  # files could not hold it
+        if number > MAX_WHOLE:
             raise argparse.ArgumentTypeError(f"{text}: expected at most 2^63 - 1")
         return int(number)
 

@@ -337,6 +337,7 @@ DAMPING = 0.02
 """Damping of position tasks [m/rad or 1]; in ``solve_pose_ik`` it is relative to the largest
 singular value of the Jacobian."""
 MAX_STEP = 0.3  # largest change of a joint position in one iteration [rad or m]
+POSITION_ITERATIONS = 25  # number of iterations of ``solve_position_ik``
 POSE_ITERATIONS = 24
 """Maximum number of iterations of ``solve_pose_ik``, which runs while the user drags a gizmo."""
 POSE_TOLERANCE = 1e-5  # weighted pose error at which solve_pose_ik stops [m]
@@ -354,7 +355,7 @@ def dls_step(J: Array, error: Array, damping: float) -> Array:
 
 
 def solve_position_ik(
-    robot: Robot, q: Array, positions: Array, *, iterations: int = 25, tolerance: float = 0.0
+    robot: Robot, q: Array, positions: Array, *, tolerance: float = 0.0
 ) -> tuple[Array, Array]:
     """Move tools from q (n, dof) to positions (n, 3) in the root frame by damped least squares.
 
@@ -364,7 +365,7 @@ def solve_position_ik(
     low, high = joint_limits(robot).T
     q = np.clip(q, low, high)
     rows = np.arange(len(q))
-    for _ in range(iterations):
+    for _ in range(POSITION_ITERATIONS):
         T_root_tool, J_root_tool = frame_jacobian(robot, q[rows])
         error = positions[rows] - T_root_tool[:, :3, 3]
         if tolerance:

@@ -16,7 +16,7 @@ from torch.utils.data import Dataset
 
 from morphgen.encoding.robot_hash import HASH_LENGTH
 from morphgen.encoding.tokens import default_max_links
-from morphgen.errors import FormatError, TaskError, one_line
+from morphgen.errors import MAX_WHOLE, FormatError, TaskError, one_line
 from morphgen.formats.data_files import read_bytes, read_json
 from morphgen.model.robot import Robot
 from morphgen.rl.demonstrations.lerobot import (
@@ -126,7 +126,7 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
             place = row["episode_index"], row["dataset_from_index"]
             if place != (index, end) or episode.length < 1:
                 raise ValueError(f"episode {index} does not begin where the one before it ends")
-            if episode.robot_index < 0 or not 0 <= episode.seed < 2**63:
+            if episode.robot_index < 0 or not 0 <= episode.seed <= MAX_WHOLE:
                 raise ValueError(f"episode {index} has a negative robot_index or seed")
             if self.robot_hashes[episode.robot_index] != episode.robot_hash:
                 raise ValueError(f"episode {index} has another robot than its robot_index")

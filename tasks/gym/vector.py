@@ -107,7 +107,7 @@ def batch_options(
 
 
 class BatchEnv:
-    """What single environments and vectors have in common.
+    """Base of single environments and of vectors: a batch that is closed with them.
 
     Attributes:
         batch: The batch, which it owns.

@@ -35,7 +35,7 @@ import numpy as np
 from filelock import FileLock
 from msgspec import Meta
 
-from morphgen.errors import BenchmarkError, MorphgenError, TaskError, nearest
+from morphgen.errors import MAX_WHOLE, BenchmarkError, MorphgenError, TaskError, nearest
 from morphgen.files import write_atomic
 from morphgen.formats.data_files import parse_json, read_bytes, read_json
 from morphgen.formats.files import LOCK
@@ -57,7 +57,7 @@ from morphgen.tasks.scenes.env_specs import (
 
 FORMAT = 1
 KIND = "morphgen submission"
-Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Seed = Annotated[int, Meta(ge=0, le=MAX_WHOLE)]
 
 
 class SplitName(Record, frozen=True):
@@ -551,7 +551,7 @@ class EvalProtocol:
             )
         numbers = (self.episodes, self.seed)
         is_whole = all(type(number) is int for number in numbers)
-        if not (is_whole and 1 <= self.episodes <= 10_000 and 0 <= self.seed < 2**63):
+        if not (is_whole and 1 <= self.episodes <= 10_000 and 0 <= self.seed <= MAX_WHOLE):
             raise BenchmarkError(
                 f"{self.episodes} episodes of seed {self.seed}: expected 1 to 10000 episodes, and "
                 "a seed of 0 or more, both whole numbers"
