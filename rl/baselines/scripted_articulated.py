@@ -28,9 +28,9 @@ from morphgen.rl.baselines.scripted_push import (
     ScriptedPush,
 )
 from morphgen.tasks.articulated.envs import ArticulatedEnvs
-from morphgen.tasks.articulated.starts import ArticulatedStartSet, PathFinder
+from morphgen.tasks.articulated.task import ArticulatedStartSet, PathFinder
 from morphgen.tasks.batch import TaskBatch
-from morphgen.tasks.push.starts import BEHIND
+from morphgen.tasks.push.task import BEHIND
 from morphgen.tasks.scenes.robot_tables import RobotTables
 from morphgen.tasks.sim.base import CONTROL_PERIOD
 from morphgen.tasks.task import EnvSpec

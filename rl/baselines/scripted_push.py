@@ -31,7 +31,7 @@ from morphgen.rl.baselines.path_planner import (
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.free_space import FreeSpace
-from morphgen.tasks.push.starts import PushStartSet, sample_tools_in_box
+from morphgen.tasks.push.task import PushStartSet, sample_tools_in_box
 from morphgen.tasks.scenes.robot_tables import RobotTables
 from morphgen.tasks.sim.base import CONTROL_PERIOD, GRAVITY, Scene
 from morphgen.tasks.task import EnvSpec

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,7 +11,6 @@ from numpy.typing import NDArray
 
 from morphgen.model.geometry import Pose
 from morphgen.model.inertia import bounding_box
-from morphgen.tasks.articulated.starts import ArticulatedStartSet
 from morphgen.tasks.configs import ArticulatedConfig
 from morphgen.tasks.observation import box_tokens
 from morphgen.tasks.push.envs import GAP, curriculum_part, moving_result
@@ -144,12 +144,12 @@ class ArticulatedEnvs(TaskEnvs):
     ) -> None:
         """Set up with the whole travel; arguments as of ``Task.make_envs``."""
         self._config: ArticulatedConfig = specs[0].config  # type: ignore[assignment]  # its own type
-        sets: list[ArticulatedStartSet] = [spec.goals for spec in specs]  # type: ignore[misc]
+        sets: list[Any] = [spec.goals for spec in specs]  # each an ArticulatedStartSet
         device = env_spec_index.device
         self._env_spec_index = env_spec_index
         self._choices = GoalChoices(sets, 1, env_spec_index)
         self._q = padded_rows([starts.q for starts in sets], num_joints, device)
-        columns = [_motions(starts) for starts in sets]
+        columns = [starts.motions(GAP) for starts in sets]
         self._motions = padded_rows(columns, columns[0].shape[1], device)
         self.fraction = torch.ones(len(env_spec_index), device=device)
         """Part of the travel that is a success now, shape (k,)."""
@@ -215,11 +215,3 @@ class ArticulatedEnvs(TaskEnvs):
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
         """Restore the part of the travel."""
         self.fraction.copy_(state["fraction"])
-
-
-def _motions(starts: ArticulatedStartSet) -> NDArray[np.float64]:
-    """Return rows of a set: start, goal, poses there, points on the surface and before, (S, 22)."""
-    thing, sign = starts.thing, np.sign(starts.goal - starts.start)
-    ends = [thing.placed_joint.poses(each) for each in (starts.start, starts.goal)]
-    points = [thing.behind(sign, gap) for gap in (0.0, GAP * starts.scale)]
-    return np.concatenate([starts.start[:, None], starts.goal[:, None], *ends, *points], axis=1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 
 from morphgen.tasks.configs import PushConfig
 from morphgen.tasks.observation import box_tokens
-from morphgen.tasks.push.starts import PushStartSet
 from morphgen.tasks.random_numbers import EpisodeRandom, Stream
 from morphgen.tasks.rows import (
     GoalChoices,
@@ -63,7 +63,7 @@ class PushEnvs(TaskEnvs):
     ) -> None:
         """Set up with the line at its final position; arguments as of ``Task.make_envs``."""
         self._config: PushConfig = specs[0].config  # type: ignore[assignment]  # its own type
-        sets: list[PushStartSet] = [spec.goals for spec in specs]  # type: ignore[misc]
+        sets: list[Any] = [spec.goals for spec in specs]  # each a PushStartSet
         device = env_spec_index.device
         self._env_spec_index = env_spec_index
         self._choices = GoalChoices(sets, 1, env_spec_index)

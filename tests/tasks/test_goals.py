@@ -28,8 +28,8 @@ from morphgen.tasks import goal_sets
 from morphgen.tasks.configs import PushConfig, ReachConfig
 from morphgen.tasks.free_space import SAME, FreeSpace, cspace_components, in_other_component
 from morphgen.tasks.goal_sets import set_npz
-from morphgen.tasks.push import starts
-from morphgen.tasks.push.starts import push_region
+from morphgen.tasks.push import task as starts
+from morphgen.tasks.push.task import push_region
 from morphgen.tasks.reach import task as module
 from morphgen.tasks.reach.task import REACH
 from morphgen.tasks.registry import TASKS
