@@ -17,13 +17,7 @@ from msgspec import NODEFAULT
 
 from morphgen.errors import TaskError, nearest
 from morphgen.formats.records import Record, dotted_values, read_record
-from morphgen.rl.agents import (
-    AGENTS,
-    NetworkConfig,
-    network_fields,
-    preset_of,
-    require_numbers,
-)
+from morphgen.rl.agents import AGENTS, NetworkConfig, network_fields, preset_of, require_numbers
 from morphgen.splits.split import Side
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.observation import observation_config

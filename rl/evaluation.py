@@ -31,14 +31,7 @@ from morphgen.rl.runs.robot_source import (
     tasks_of,
 )
 from morphgen.rl.runs.training import checkpoint_files
-from morphgen.rl.scores import (
-    LISTS,
-    RobotOutcomes,
-    Score,
-    finite_or_none,
-    score_of,
-    success_of,
-)
+from morphgen.rl.scores import LISTS, RobotOutcomes, Score, finite_or_none, score_of, success_of
 from morphgen.rl.shipped_policies import name_of
 from morphgen.splits.split import Side
 from morphgen.tasks.batch import TaskBatch
@@ -83,12 +76,7 @@ def evaluate_run(path: Path, side: Side, config: EvalConfig, mode: Mode) -> list
 
 
 def evaluate_checkpoints(
-    paths: Sequence[Path],
-    source: Source,
-    config: EvalConfig,
-    mode: Mode,
-    *,
-    device: str = "cpu",
+    paths: Sequence[Path], source: Source, config: EvalConfig, mode: Mode, *, device: str = "cpu"
 ) -> list[Score]:
     """Evaluate the trained policies of a run.
 

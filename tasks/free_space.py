@@ -184,11 +184,7 @@ class FreeSpace:
         return self._checker.free(self._positions(q, blocks), stop=stop)
 
     def free_fraction(
-        self,
-        start: Array,
-        end: Array,
-        block: Array | None = None,
-        resolution: float = RESOLUTION,
+        self, start: Array, end: Array, block: Array | None = None, resolution: float = RESOLUTION
     ) -> float:
         """Return the fraction of a straight path between configurations that is free, from 0 to 1.
 

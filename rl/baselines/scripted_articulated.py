@@ -16,17 +16,8 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.model.kinematics import unwrap_joints
-from morphgen.rl.baselines.path_planner import (
-    Path,
-    PathCost,
-    PathPlanner,
-)
-from morphgen.rl.baselines.scripted_push import (
-    LEAD_STEP,
-    SPEED,
-    ScriptedController,
-    ScriptedPush,
-)
+from morphgen.rl.baselines.path_planner import Path, PathCost, PathPlanner
+from morphgen.rl.baselines.scripted_push import LEAD_STEP, SPEED, ScriptedController, ScriptedPush
 from morphgen.tasks.articulated.envs import ArticulatedEnvs
 from morphgen.tasks.articulated.task import ArticulatedStartSet, PathFinder
 from morphgen.tasks.batch import TaskBatch

@@ -168,12 +168,7 @@ class PushPlanner:
     """Plans pushes of one robot and its block."""
 
     def __init__(
-        self,
-        spec: EnvSpec,
-        scene: Scene,
-        tables: RobotTables,
-        robot: int,
-        rng: np.random.Generator,
+        self, spec: EnvSpec, scene: Scene, tables: RobotTables, robot: int, rng: np.random.Generator
     ) -> None:
         """Collect free configurations with a low tool in the region of the push."""
         starts, self._robot = spec.goals, spec.robot
@@ -522,12 +517,7 @@ def touches(
 
 
 def _gaps(
-    space: FreeSpace,
-    q: Array,
-    blocks: Array,
-    edge: float,
-    first: NDArray[np.intp],
-    dz: float = 0.0,
+    space: FreeSpace, q: Array, blocks: Array, edge: float, first: NDArray[np.intp], dz: float = 0.0
 ) -> Array:
     """Return how far blocks (n, 7), shifted by ``dz``, are along y from the robot, (n,) [m].
 

@@ -284,10 +284,7 @@ def _statistics(columns: Arrays) -> dict[str, list[float] | list[int]]:
 
 
 def _write_meta(
-    folder: Path,
-    rows: Sequence[Mapping[str, Any]],
-    features: Sequence[str],
-    tasks: Sequence[str],
+    folder: Path, rows: Sequence[Mapping[str, Any]], features: Sequence[str], tasks: Sequence[str]
 ) -> None:
     """Write the tasks, the episodes and the statistics of all episodes."""
     import pyarrow as pa

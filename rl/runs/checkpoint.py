@@ -29,13 +29,7 @@ from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import PolicyConfig, PPOConfig, differences, policy_from, read_fields
 from morphgen.rl.observation_layout import Layout
 from morphgen.rl.policies import make_networks
-from morphgen.rl.runs.robot_source import (
-    Source,
-    identity,
-    most_obstacles,
-    source_from,
-    tasks_of,
-)
+from morphgen.rl.runs.robot_source import Source, identity, most_obstacles, source_from, tasks_of
 from morphgen.tasks.actions import ActionKind
 from morphgen.tasks.observation import ObservationConfig, observation_config
 from morphgen.tasks.registry import DEFAULT_SIMULATOR, SIMULATORS, TASKS

@@ -26,13 +26,7 @@ from morphgen.processes import one_torch_thread
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import PPOConfig, differences, policy_from
 from morphgen.rl.demonstrations.cloning import Cloner, DemonstrationBatches
-from morphgen.rl.observation_layout import (
-    Layout,
-    last_link,
-    layout_of,
-    require_layout,
-    with_fields,
-)
+from morphgen.rl.observation_layout import Layout, last_link, layout_of, require_layout, with_fields
 from morphgen.rl.ppo import FINETUNING_ACTOR_LR_SCALE, Learner, UpdateMetrics
 from morphgen.rl.runs.checkpoint import (
     CHECKPOINT,
@@ -191,12 +185,7 @@ def slice_of(num_robots: int, size: int, number: int, seed: int) -> list[int]:
 class TrainingBatches:
     """Makes the batches of a run; batches and their seeds depend on the config only."""
 
-    def __init__(
-        self,
-        config: RunConfig,
-        *,
-        workers: int | None = None,
-    ) -> None:
+    def __init__(self, config: RunConfig, *, workers: int | None = None) -> None:
         """Build the robots and their goal sets."""
         self._config, self._workers = config, workers
         self._device = batch_device(config.sim, config.device)

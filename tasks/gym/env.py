@@ -229,8 +229,7 @@ class TaskEnv(BatchEnv, gym.Env[NumpyObservation, NDArray[Any]]):
         self._stepper = NumpyStepper(batch, self._without_padding)
         first = self._without_padding(self.batch.observe())
         self.observation_space = cast(
-            "gym.Space[NumpyObservation]",
-            observation_space({k: v[None] for k, v in first.items()}),
+            "gym.Space[NumpyObservation]", observation_space({k: v[None] for k, v in first.items()})
         )
         self.action_space = action_space(batch.action_kind, len(self.action_links))
 

@@ -22,11 +22,7 @@ from morphgen.formats.urdf.read import UnsoundError
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar.robot_source import import_robot
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
-from morphgen.model.kinematics import (
-    forward_kinematics,
-    movable_positions,
-    random_configurations,
-)
+from morphgen.model.kinematics import forward_kinematics, movable_positions, random_configurations
 from morphgen.model.mesh import convex_hull, load_mesh
 from morphgen.model.robot import Inertial, Joint, Link, Robot
 

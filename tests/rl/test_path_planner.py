@@ -228,8 +228,7 @@ def test_joints_of_two_turns_take_the_shorter_way(made, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("words", "goal"),
-    [(CLAW, "position"), (CHAIN, "position"), (CLAW, "pose"), ("prims", "pose")],
+    ("words", "goal"), [(CLAW, "position"), (CHAIN, "position"), (CLAW, "pose"), ("prims", "pose")]
 )
 def test_goals_are_reached_also_by_robots_whose_links_obstruct_each_other(made, words, goal):
     batch = made(words, 8, configs=(replace(REACH, goal=goal),))

@@ -10,15 +10,7 @@ import torch
 
 from helpers.faulty_robots import with_joint
 from helpers.robots import arm
-from helpers.scenes import (
-    homes,
-    push_scene,
-    reach_scene,
-    real_arm_scene,
-    reset_envs,
-    robot,
-    state,
-)
+from helpers.scenes import homes, push_scene, reach_scene, real_arm_scene, reset_envs, robot, state
 from morphgen.errors import SimulationError
 from morphgen.model.geometry import Pose
 from morphgen.model.kinematics import joint_limits

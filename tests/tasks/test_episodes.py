@@ -30,9 +30,7 @@ REACH = ReachConfig(num_goals=6, max_episode_steps=9, train_layouts=3, eval_layo
 PUSH = PushConfig(num_goals=6, max_episode_steps=11, train_layouts=3, eval_layouts=1)
 POSE = replace(REACH, goal="pose")
 CHANNELS = replace(
-    observation_config({*CHANNELS_BY_NAME} - {"ik", "points", "no_state"}),
-    tool=True,
-    points=12,
+    observation_config({*CHANNELS_BY_NAME} - {"ik", "points", "no_state"}), tool=True, points=12
 )
 """All channels but ``ik``, which plans on the CPU."""
 BOUND = 6.0
@@ -190,8 +188,7 @@ def test_a_resumed_batch_begins_the_same_episodes(specs):
 
 
 @pytest.mark.parametrize(
-    "names",
-    [MIXED, *(pytest.param((task,), marks=pytest.mark.slow) for task in ("reach", "push"))],
+    "names", [MIXED, *(pytest.param((task,), marks=pytest.mark.slow) for task in ("reach", "push"))]
 )
 def test_skipping_what_changes_nothing_changes_no_bit(specs, names, monkeypatch):
     skipping, complete = (stub_batch(specs, names, 6, seed=3, observe=CHANNELS) for _ in range(2))

@@ -35,12 +35,7 @@ from morphgen.tasks.reach.task import REACH
 from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes import obstacles
 from morphgen.tasks.scenes.env_specs import GoalConfig
-from morphgen.tasks.scenes.obstacles import (
-    KEPT,
-    fewest_goals,
-    layouts_of,
-    place_boxes,
-)
+from morphgen.tasks.scenes.obstacles import KEPT, fewest_goals, layouts_of, place_boxes
 from morphgen.tasks.sim.articulated import ground_contact_links
 from morphgen.tasks.sim.base import Block, Scene
 
@@ -474,10 +469,7 @@ LIKE_SURROUNDINGS = rename(aside(), {"plate": "world", "ball": "ground"}, {"z": 
         (Scene(aside(), Pose((0.0, 0.0, 1.0))), {0.5: True, -0.5: True}),
         (Scene(aside(), object=replace(SLAB, mass=0.1)), {0.0: True}),
         (Scene(aside(), obstacles=(replace(SLAB, mass=0.1),)), {0.0: False}),
-        (
-            Scene(LIKE_SURROUNDINGS, obstacles=(SLAB,)),
-            {0.0: False, -0.41: False, 0.9: True},
-        ),
+        (Scene(LIKE_SURROUNDINGS, obstacles=(SLAB,)), {0.0: False, -0.41: False, 0.9: True}),
     ],
 )
 def test_configurations_are_free_where_nothing_penetrates(scene, expected):

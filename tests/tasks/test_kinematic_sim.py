@@ -179,8 +179,7 @@ def test_kinematic_is_a_registered_simulator_that_mujoco_judges():
 
 
 @pytest.mark.parametrize(
-    ("task", "obstacles", "thing"),
-    [("push", False, "an object"), ("reach", True, "obstacles")],
+    ("task", "obstacles", "thing"), [("push", False, "an object"), ("reach", True, "obstacles")]
 )
 def test_batches_with_something_to_touch_are_refused(cache, task, obstacles, thing):
     configs = (PushConfig(num_goals=2), ReachConfig(num_goals=2))
