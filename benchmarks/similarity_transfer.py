@@ -19,7 +19,7 @@ robots, and a cell is the mean of these correlations over the policies. So polic
 for all robots, because they were trained on more of them, do not change it. A policy that has the
 same success on all robots has no correlation; the column "policies" has the number of the others.
 Positive means: more similar, more success. The last two columns are no similarity, but the number
-of movable joints from the root to the tool, and the reach: more of it, more success.
+of movable joints from the root to the tool, and the reach from the root: more of it, more success.
 
 In brackets is the 95% interval of a bootstrap that draws the test robots of a variant with
 replacement, the same ones for all policies and columns, and computes the mean again; draws in which
@@ -46,9 +46,18 @@ from morphgen.benchmark.survey import Fault, SplitSurvey, survey_split
 from morphgen.encoding.similarity import MEASURES, most_alike
 from morphgen.errors import BenchmarkError, MorphgenError
 from morphgen.files import write_atomic
+from morphgen.formats.rounding import round_number
 from morphgen.grammar.library import Library, default_library
+from morphgen.model.kinematics import reach_from_root
 from morphgen.rl.runs.robot_source import read_drawn
-from morphgen.splits.split import Member, RobotFactory, Split, read_split, recipe_of
+from morphgen.splits.split import (
+    Member,
+    RobotFactory,
+    Split,
+    compose_member,
+    read_split,
+    recipe_of,
+)
 from morphgen.typing import Array
 from robot_curve import REAL_ARMS, VARIANTS, policy_name, read_scores
 
@@ -145,9 +154,10 @@ def compare(policies: list[Policy], survey: SplitSurvey) -> Iterator[Row]:
                 best = most_alike(alike, name)
                 assert best is not None, f"no training robot of {policy.variant} has a workspace"
                 values[name] = round(float(alike[best]), DIGITS)
-            values |= {"joints": stats[tested].movable_to_tool, "reach": stats[tested].reach}
-            robot = policy.test[key].name
-            yield Row(policy.variant, policy.robots, policy.seed, robot, success, values)
+            robot = compose_member(policy.test[key], default_library())
+            reach = round_number(reach_from_root(robot))
+            values |= {"joints": stats[tested].movable_to_tool, "reach": reach}
+            yield Row(policy.variant, policy.robots, policy.seed, robot.name, success, values)
 
 
 def spearman(x: Array, y: Array, counts: Array) -> Array:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from morphgen.errors import MAX_WHOLE, TaskError
-from morphgen.model.kinematics import reach
+from morphgen.model.kinematics import reach_from_root
 from morphgen.progress import part_of, show_progress, stage
 from morphgen.rl.baselines import BASELINES, ZERO, Controller, baselines_for
 from morphgen.rl.baselines.reach import Random
@@ -176,7 +176,7 @@ def evaluate(
             random_score=tuple(each.score for each in of_random),
             random_success=tuple(each.success for each in of_random),
         )
-        scores.append(score_of(outcomes, [each.angle for each in own], reach(spec.robot)))
+        scores.append(score_of(outcomes, [each.angle for each in own], reach_from_root(spec.robot)))
     return scores
 
 

@@ -282,7 +282,7 @@ class Score:
     random_success: float  # success rate of the random policy's episodes, 0 to 1
     distance: float  # mean distance from success at the end of an episode [m]
     relative_distance: float
-    """``distance`` divided by the robot's reach; nan for tasks without ``relative_distance``."""
+    """``distance`` over the robot's ``reach_from_root``; nan for tasks without such a distance."""
     unstable: int  # number of episodes that ended because the simulation diverged
     angle: float  # mean angle from success at the end of an episode [rad]; nan without orientation
     success_low: float  # lower end of the 95% Wilson interval of `success`
@@ -295,8 +295,8 @@ SCORE_KEYS = tuple(each.name for each in fields(Score) if each.name != "outcomes
 """Keys of a score in JSON, and columns of CSV."""
 
 
-def score_of(outcomes: RobotOutcomes, angles: Sequence[float], reach: float) -> Score:
-    """Return the score of a robot of a reach [m] from its episodes and their last angles."""
+def score_of(outcomes: RobotOutcomes, angles: Sequence[float], reach_from_root: float) -> Score:
+    """Return the score of a robot from its episodes and their last angles."""
     task, distance = TASKS[outcomes.task], float(np.mean(outcomes.distance))
     interval = episode_interval(
         [[relative_scores(outcomes)]], [[outcomes.success]], relative=task.relative_to_random
@@ -316,7 +316,7 @@ def score_of(outcomes: RobotOutcomes, angles: Sequence[float], reach: float) -> 
         success=success.value,
         random_success=float(np.mean(outcomes.random_success)),
         distance=distance,
-        relative_distance=distance / reach if task.relative_distance else math.nan,
+        relative_distance=distance / reach_from_root if task.relative_distance else math.nan,
         unstable=sum(outcomes.diverged),
         angle=float(np.mean(angles)),
         success_low=success.low,

@@ -419,7 +419,7 @@ class Task(ABC, Generic[C, G]):
 
         Args:
             config: Constants of the task.
-            reach: Reach of the robot [m].
+            reach: Largest distance of the robot's tool from its root [m].
         """
         return -math.inf, math.inf
 

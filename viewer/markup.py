@@ -14,7 +14,7 @@ from morphgen.benchmark.licences import find_licence
 from morphgen.formats.bundle import part_licences
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Mesh, Shape, dimensions
-from morphgen.model.kinematics import arm_reach
+from morphgen.model.kinematics import reach
 from morphgen.model.robot import Joint, Link, Robot
 from morphgen.viewer.app.address import Address
 
@@ -153,7 +153,7 @@ def summary(robot: Robot, links: str) -> str:
     """Return a robot's name, numbers of links and joints, mass and reach, followed by HTML."""
     facts = [f"{len(robot.links)} links", f"{robot.dof} DoF", f"{robot.mass:.3g} kg"]
     if robot.tool and robot.dof:
-        facts.append(f"reach {arm_reach(robot):.3g} m")
+        facts.append(f"reach {reach(robot):.3g} m")
     if mimics := len(robot.movable_joints) - robot.dof:
         facts.insert(2, f"{mimics} mimic joint{'s' if mimics > 1 else ''}")
     text = f"{' · '.join(facts)}{licence_line(robot)}{links}"

@@ -48,7 +48,7 @@ class RobotStats:
     movable: int  # number of movable joints, mimic joints included
     movable_to_tool: int  # number of movable joints between the root and the tool's link
     dof: int  # number of independent joints
-    reach: float  # largest distance of the tool from the root's origin [m]
+    reach: float  # largest distance of the tool from the first joint that moves it [m]
     mass: float  # total mass [kg]
 
 

@@ -21,7 +21,7 @@ from morphgen.model.kinematics import (
     frame_positions,
     joint_axes,
     joint_limits,
-    reach,
+    reach_from_root,
     with_root_at,
 )
 from morphgen.model.robot import TOOL, Joint, Robot
@@ -69,7 +69,9 @@ def _tool_points(robot: Robot) -> tuple[Array, Vec3, float]:
     centre = shoulder(robot)
     centred = with_root_at(robot, centre)
     points = frame_positions(centred, _configurations(centred, chain))
-    farthest = max(reach(centred, TOOL), float(np.sqrt((points * points).sum(axis=0).max())))
+    farthest = max(
+        reach_from_root(centred, TOOL), float(np.sqrt((points * points).sum(axis=0).max()))
+    )
     if farthest < _IMMOBILE:
         raise BenchmarkError(
             f"robot {robot.name!r}: its tool only turns about its own origin, so it has no "

@@ -42,7 +42,7 @@ from morphgen.formats.xml import found, root_tag
 from morphgen.model.dynamics import actuation
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere, StoredFits
-from morphgen.model.kinematics import arm_reach
+from morphgen.model.kinematics import reach
 from morphgen.model.mesh import (
     MAX_STL_FACES,
     kept_of_mesh,
@@ -310,7 +310,7 @@ def robot_card(
         "movable": len(robot.movable_joints),
         "dof": robot.dof,
         "mass": round_number(robot.mass),
-        "reach": round_number(arm_reach(robot)) if robot.tool and robot.dof else None,
+        "reach": round_number(reach(robot)) if robot.tool and robot.dof else None,
         "home": {joint.name: round_number(q) for joint, q in zip(joints, robot.home, strict=True)},
         "frames": {
             frame.name: {

@@ -110,7 +110,7 @@ def _version(package: str) -> str:
 
 def _reach(part: Part) -> float:
     """Return the largest distance from the mount to a port or tool over all configurations [m]."""
-    from morphgen.model.kinematics import reach
+    from morphgen.model.kinematics import reach_from_root
     from morphgen.model.robot import Frame, Joint, Link
 
     ends = [*part.ports.values(), *([part.tool] if part.tool else [])]
@@ -124,7 +124,7 @@ def _reach(part: Part) -> float:
         frames=tuple(Frame(f"end{i}", e.link, e.T_link_frame) for i, e in enumerate(ends)),
     )
     names = [frame.name for frame in rooted_at_mount.frames]
-    return max((reach(rooted_at_mount, name) for name in names), default=0.0)
+    return max((reach_from_root(rooted_at_mount, name) for name in names), default=0.0)
 
 
 def main() -> None:

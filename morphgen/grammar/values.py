@@ -12,7 +12,7 @@ from morphgen.errors import GrammarError
 from morphgen.grammar.manifest import UNITS
 from morphgen.grammar.syntax import Expression, parse_condition, unknown
 from morphgen.model.inertia import bounding_box, box_corners
-from morphgen.model.kinematics import forward_kinematics, reach
+from morphgen.model.kinematics import forward_kinematics, reach, reach_from_root
 from morphgen.model.robot import Robot
 
 
@@ -212,8 +212,13 @@ class RobotProperties:
 
     @cached_property
     def reach(self) -> float:
-        """Largest distance of the tool from the root's origin [m]; 0 without a tool."""
+        """Largest distance of the tool from the first joint that moves it [m]; 0 without a tool."""
         return reach(self._robot) if self._robot.tool else 0.0
+
+    @cached_property
+    def reach_from_root(self) -> float:
+        """Largest distance of the tool from the root's origin [m]; 0 without a tool."""
+        return reach_from_root(self._robot) if self._robot.tool else 0.0
 
     @cached_property
     def movable_to_tool(self) -> float:
@@ -237,6 +242,7 @@ class RobotProperties:
 
 PROPERTIES: Mapping[str, str] = {
     "reach": "m",
+    "reach_from_root": "m",
     "mass": "kg",
     "dof": "",
     "links": "",

@@ -173,7 +173,7 @@ def link_jacobians(robot: Robot, T_root_link: Array) -> Array:
     return jacobians
 
 
-def reach(robot: Robot, frame: str = TOOL, samples: int = 256, rounds: int = 6) -> float:
+def reach_from_root(robot: Robot, frame: str = TOOL, samples: int = 256, rounds: int = 6) -> float:
     """Return the largest distance between a frame and the root's origin [m], by random search.
 
     The seed is fixed, so that it is a property of the robot. The travel of a prismatic base counts.
@@ -198,14 +198,17 @@ def reach(robot: Robot, frame: str = TOOL, samples: int = 256, rounds: int = 6) 
     return float(distance.max())
 
 
-def arm_reach(robot: Robot) -> float:
-    """Return the largest distance of the tool from the first joint that moves it [m]."""
+def reach(robot: Robot) -> float:
+    """Return the largest distance of the tool from the first joint that moves it [m].
+
+    Data sheets of arms have this number: it does not depend on the base under the arm.
+    """
     T_root_joint = IDENTITY
     for k in robot.joint_chain(robot.frame(TOOL).link):
         T_root_joint = T_root_joint @ robot.joints[k].T_parent_joint
         if robot.joints[k].is_movable:
-            return reach(with_root_at(robot, T_root_joint.position))
-    return reach(robot)
+            return reach_from_root(with_root_at(robot, T_root_joint.position))
+    return reach_from_root(robot)
 
 
 def with_root_at(robot: Robot, point: Vec3) -> Robot:

@@ -34,7 +34,7 @@ from morphgen.encoding.tokens import pad_tokens, tokens
 from morphgen.errors import BenchmarkError, RobotError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.geometry import Box, Capsule, Cylinder, Mesh, Pose, Shape, Sphere
-from morphgen.model.kinematics import reach
+from morphgen.model.kinematics import reach_from_root
 from morphgen.model.robot import Frame, Joint, Link, Robot
 from morphgen.model.tree import rename, scale_links
 from morphgen.progress import show_progress
@@ -228,7 +228,7 @@ def test_the_origin_of_a_joint_on_its_axis_does_not_matter():
         if joint.parent == first.child:
             up = down.inverse() @ joint.T_parent_joint
             moved = with_joint(moved, joint.name, T_parent_joint=up)
-    assert reach(moved) == pytest.approx(reach(robot))
+    assert reach_from_root(moved) == pytest.approx(reach_from_root(robot))
     assert shoulder(moved) == pytest.approx(shoulder(robot))
     assert density_overlap(workspace(moved), workspace(robot)) == pytest.approx(1, abs=1e-9)
 

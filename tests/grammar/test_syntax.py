@@ -321,10 +321,11 @@ def test_height_is_measured_at_the_highest_point_at_home():
     assert RobotProperties(lying).height == pytest.approx(0.05 + 0.02, abs=1e-3)
 
 
-def test_reach_is_measured_from_the_root_and_undefined_without_a_tool():
-    assert RobotProperties(arm()).reach == pytest.approx(0.05 + 0.3 + 0.3 + 0.04 + 0.28, abs=0.02)
-    toolless = replace(arm(), frames=())
-    assert (RobotProperties(toolless).reach, RobotProperties(toolless).movable_to_tool) == (0, 0)
+def test_reach_is_measured_from_the_first_joint_or_the_root_and_is_zero_without_a_tool():
+    properties, toolless = RobotProperties(arm()), RobotProperties(replace(arm(), frames=()))
+    assert properties.reach == pytest.approx(0.3 + 0.3 + 0.04 + 0.28, abs=0.02)
+    assert properties.reach_from_root == pytest.approx(0.05 + properties.reach, abs=0.02)
+    assert (toolless.reach, toolless.reach_from_root, toolless.movable_to_tool) == (0, 0, 0)
 
 
 @pytest.mark.parametrize(

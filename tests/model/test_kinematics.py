@@ -19,7 +19,6 @@ from morphgen.model.kinematics import (
     DAMPING,
     MAX_STEP,
     FramePosition,
-    arm_reach,
     dls_step,
     driving_joints,
     forward_kinematics,
@@ -31,6 +30,7 @@ from morphgen.model.kinematics import (
     periodic_joints,
     random_configurations,
     reach,
+    reach_from_root,
     solve_pose_ik,
     solve_position_ik,
     unwrap_joints,
@@ -198,9 +198,9 @@ def test_reach_of_an_arm_does_not_depend_on_its_mount(mount):
     robot = replace(planar, frames=(Frame("tool", "link3", Pose((0.25, 0.0, 0.0))),))
     stand = Joint("stand", "fixed", "floor", robot.root.name, mount)
     mounted = replace(robot, links=(Link("floor"), *robot.links), joints=(stand, *robot.joints))
-    assert reach(robot) == pytest.approx(1.0, rel=1e-4)
-    assert arm_reach(mounted) == pytest.approx(0.75, rel=1e-4)
-    assert reach(mounted) > 1.1
+    assert reach_from_root(robot) == pytest.approx(1.0, rel=1e-4)
+    assert reach(mounted) == pytest.approx(0.75, rel=1e-4)
+    assert reach_from_root(mounted) > 1.1
 
 
 def test_unwrapped_configurations_are_nearest_to_the_reference():

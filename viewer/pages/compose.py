@@ -28,7 +28,7 @@ from morphgen.grammar.request import MAIN_PORTS, SLOTS, default_name, known_gram
 from morphgen.grammar.sampling import GRAMMAR, sample_robot
 from morphgen.grammar.syntax import Derivation, parse_derivation
 from morphgen.model.inertia import box_corners
-from morphgen.model.kinematics import arm_reach
+from morphgen.model.kinematics import reach
 from morphgen.model.robot import Robot
 from morphgen.typing import Array
 from morphgen.viewer import markup
@@ -622,7 +622,7 @@ def change_text(before: Robot, after: Robot) -> str:
     if before.dof != after.dof:
         parts.append(f"{before.dof} to {after.dof} DoF")
     if all(robot.tool and robot.dof for robot in (before, after)):
-        old, new = (f"{arm_reach(robot):.2f}" for robot in (before, after))
+        old, new = (f"{reach(robot):.2f}" for robot in (before, after))
         if old != new:
             parts.append(f"reach {old} to {new} m")
     if abs(difference := after.mass - before.mass) >= 0.005:

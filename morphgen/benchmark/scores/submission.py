@@ -41,7 +41,7 @@ from morphgen.formats.data_files import parse_json, read_bytes, read_json
 from morphgen.formats.files import LOCK
 from morphgen.formats.records import Record, dotted_values, read_record
 from morphgen.grammar.library import Library
-from morphgen.model.kinematics import reach
+from morphgen.model.kinematics import reach_from_root
 from morphgen.processes import parallel_map
 from morphgen.progress import note
 from morphgen.rl.scores import LISTS, Count, Name, RobotOutcomes, Score
@@ -363,7 +363,7 @@ def _check_episodes(
 ) -> None:
     task = TASKS[expected.member.task]
     config = protocol.goals.task_config(expected.member.task)
-    low, high = task.score_range(config, expected.reach)
+    low, high = task.score_range(config, expected.reach_from_root)
     for name in ("score", "random_score"):
         for i, score in enumerate(getattr(outcomes, name)):
             if not low - ROUNDING * abs(low) <= score <= high + ROUNDING * abs(high):
@@ -569,7 +569,7 @@ class ExpectedRobot:
     side: Side
     member: Member
     goal_set: str  # key of the goal set
-    reach: float  # reach [m]
+    reach_from_root: float  # largest distance of the tool from the root [m]
 
 
 def rules_data(
@@ -627,4 +627,4 @@ def _expect(library: Library, goals: GoalConfig, sided: tuple[Side, Member]) -> 
         seed=goals.seed,
         ground=ground_under(robot),
     )
-    return ExpectedRobot(side, member, key, reach(robot))
+    return ExpectedRobot(side, member, key, reach_from_root(robot))
