@@ -13,7 +13,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -22,14 +21,7 @@ from platformdirs import user_cache_path
 
 from morphgen.cli import build_parser
 from morphgen.cli.command import parse
-from morphgen.errors import (
-    MissingDependencyError,
-    MorphgenError,
-    PartError,
-    missing_extra,
-    one_line,
-)
-from morphgen.formats.resolve import REQUIREMENTS, distribution_file
+from morphgen.errors import missing_extra, one_line
 from morphgen.processes import usable_cores
 
 NOT_FOR_USERS = frozenset(("all", "bench", "dev", "docs", "test"))
@@ -61,9 +53,6 @@ def diagnose() -> Iterator[tuple[str, Entry]]:
         yield "system", attempt(name, examine)
     for entry in packages():
         yield "packages", entry
-    yield "files", attempt("library", _library)
-    for package in REQUIREMENTS:
-        yield "files", attempt(f"robots of {package}", partial(_robot_package, package))
 
 
 def attempt(name: str, examine: Callable[[], Entry]) -> Entry:
@@ -81,12 +70,9 @@ def attempt(name: str, examine: Callable[[], Entry]) -> Entry:
             return Entry(name, "absent", text)
         if isinstance(error, ModuleNotFoundError):
             text = f"the package {error.name} is not installed; install morphgen again"
-        elif isinstance(error, MorphgenError):
-            text = str(error)
         else:
             text = f"{type(error).__name__}: {error}"
-        status: Status = "absent" if isinstance(error, MissingDependencyError) else "error"
-        return Entry(name, status, one_line(text))
+        return Entry(name, "error", one_line(text))
 
 
 def _morphgen() -> Entry:
@@ -157,67 +143,6 @@ def packages() -> Iterator[Entry]:
             yield Entry(name, "warning", f"{installed[name]} is outside of {needed}")
     listed = ", ".join(f"{name} {number}" for name, number in sorted(installed.items()))
     yield Entry("installed", "ok", listed)
-
-
-def _library() -> Entry:
-    """Count the parts, and name the folders of the user's own."""
-    # Here and below, because packages that these modules import may be broken.
-    from morphgen.grammar import library as parts
-    from morphgen.grammar.manifest import PART_KINDS
-
-    library = parts.default_library()
-    try:
-        library.paths  # noqa: B018 - which reads the folders
-    except PartError as error:
-        variable = f"{parts.LIBRARY_VARIABLE}={os.environ.get(parts.LIBRARY_VARIABLE, '')}"
-        return Entry("library", "error", f"{error}; change {variable}")
-    kinds = Counter(manifest.kind for manifest in library.manifests())
-    counts = {kind: kinds[kind] for kind in PART_KINDS}
-    listed = ", ".join(f"{count} {kind}" for kind, count in counts.items())
-    text = f"{sum(counts.values())} parts: {listed}"
-    for folder in library.folders[len(parts.shipped_folders()) :]:
-        text += (
-            f"; {len(parts.Library([folder]).paths)} of them in {folder} ({parts.LIBRARY_VARIABLE})"
-        )
-    if faults := library.faults():
-        text += f"; left out: {'; '.join(map(str, faults))}"
-    return Entry("library", "warning" if faults else "ok", one_line(text))
-
-
-def _robot_package(package: str) -> Entry:
-    """Find the files of all parts from a data package, and compare them with the tested ones."""
-    from morphgen.grammar.catalogue import source_digest, stored_facts
-    from morphgen.grammar.library import Library, shipped_folders
-    from morphgen.grammar.manifest import PackageSource
-
-    name = f"robots of {package}"
-    parts = [
-        (manifest, manifest.source.file)
-        for manifest in Library(shipped_folders()).manifests()
-        if isinstance(manifest.source, PackageSource) and manifest.source.package == package
-    ]
-    errors = []
-    for _, file in parts:
-        try:
-            distribution_file(package, file)
-        except MorphgenError as error:
-            errors.append(str(error))
-    if errors:
-        text = f"{len(errors)} of {len(parts)} parts lack their file: {errors[0]}"
-        return Entry(name, "error", text)
-    stored, number = stored_facts(), importlib.metadata.version(package)
-    changed = [
-        manifest.name
-        for manifest, _ in parts
-        if stored.get(manifest.name, {}).get("digest") != source_digest(manifest)
-    ]
-    if changed:
-        text = (
-            f"{len(changed)} of {len(parts)} parts are not those that this morphgen was tested "
-            f"with: {package} {number} is another version, or their YAML files were changed"
-        )
-        return Entry(name, "warning", text)
-    return Entry(name, "ok", f"{number}, with the files of {len(parts)} parts")
 
 
 def demo(args: argparse.Namespace) -> int:

@@ -72,24 +72,13 @@ class Library:
         of_kind = [manifest for manifest in self._sound() if kind in (None, manifest.kind)]
         return sorted(of_kind, key=lambda part: (PART_KINDS.index(part.kind), part.name))
 
-    def faults(self) -> list[PartError]:
-        """Return why parts cannot be read, by name."""
-        return [result for result in self._results() if isinstance(result, PartError)]
-
     def _sound(self) -> Iterator[Manifest]:
         """Yield the manifests of parts that can be read; a line names each other file."""
-        for result in self._results():
-            if isinstance(result, PartError):
-                note_left_out(str(result))
-            else:
-                yield result
-
-    def _results(self) -> Iterator[Manifest | PartError]:
         for path in self.paths.values():
             try:
                 yield _manifest(path)
             except PartError as error:
-                yield error
+                note_left_out(str(error))
 
 
 @lru_cache(maxsize=1024)

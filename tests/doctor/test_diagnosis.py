@@ -18,16 +18,14 @@ from morphgen.cli import doctor, main
 from morphgen.cli.doctor import Entry, attempt
 from morphgen.encoding.robot_hash import digest, robot_hash
 from morphgen.encoding.tokens import FREQUENCIES, KINDS, LAYOUT, MAX_LINKS, SHAPES, tokens
-from morphgen.errors import MissingDependencyError, PartError
 from morphgen.files import file_sha256
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats import bundle
 from morphgen.formats.bundle import CARD, write_bundle
 from morphgen.formats.files import folder_hashes
-from morphgen.grammar import catalogue
 from morphgen.grammar.compose import compose
 from morphgen.grammar.grammar_file import find_grammar, load_grammar
-from morphgen.grammar.library import LIBRARY_VARIABLE, default_library
+from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
 from morphgen.grammar.sampling import SetConfig, sample_robot
 from morphgen.model.dynamics import GRAVITY
@@ -49,18 +47,14 @@ def by_name(entries):
     return {entry.name: entry for entry in entries}
 
 
-def files():
-    return by_name(entry for section, entry in doctor.diagnose() if section == "files")
-
-
 def test_this_installation_is_sound(capsys):
     assert main(["doctor"]) == 0
     lines = capsys.readouterr().out.splitlines()
     sections = [line for line in lines if not line.startswith(" ")][:-1]
-    assert sections == ["system", "packages", "files"]
+    assert sections == ["system", "packages"]
     names = {line.split(": ")[0].split(maxsplit=1)[1] for line in lines if line.startswith(" ")}
     assert any(line.endswith("/morphgen") for line in lines)
-    assert {"installed", "cache", "gpu", "library", "robots of rtb-data"} < names
+    assert {"installed", "cache", "gpu"} < names
     assert lines[-1].startswith("sound: ")
 
 
@@ -80,9 +74,7 @@ def test_an_error_makes_the_exit_code_1(status, code, monkeypatch, capsys):
     ("error", "status", "text"),
     [
         (ModuleNotFoundError(name="torch"), "absent", "pip install 'morphgen[tasks]'"),
-        (MissingDependencyError("no PyBullet"), "absent", "no PyBullet"),
         (ModuleNotFoundError(name="lxml"), "error", "lxml is not installed; install morphgen"),
-        (PartError("unknown part"), "error", "unknown part"),
         (ValueError("two\nlines"), "error", "ValueError: two lines"),
     ],
 )
@@ -140,35 +132,6 @@ def test_a_cache_that_cannot_be_written_is_a_warning(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda *_: False)
     cache = doctor._cache()
     assert (cache.status, "cannot be written" in cache.text) == ("warning", True)
-
-
-def test_folders_of_the_user_are_named(tmp_path, monkeypatch):
-    monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path))
-    entries = files()
-    assert f"0 of them in {tmp_path} ({LIBRARY_VARIABLE})" in entries["library"].text
-    assert {entry.status for entry in entries.values()} == {"ok"}
-    (tmp_path / "broken.yaml").write_text("name: ]")
-    library = files()["library"]
-    assert library.status == "warning"
-    assert f"; left out: {tmp_path}/broken.yaml:1:7: invalid YAML" in library.text
-    monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path / "none"))
-    library = files()["library"]
-    assert library.status == "error"
-    assert f"does not exist; change {LIBRARY_VARIABLE}=" in library.text
-
-
-def test_data_packages_of_another_version_and_missing_files_are_found(monkeypatch):
-    monkeypatch.setattr(catalogue, "_version", lambda package: "9.9")
-    entry = files()["robots of rtb-data"]
-    assert entry.status == "warning"
-    assert re.match(r"(\d+) of \1 parts are not those that this morphgen was tested", entry.text)
-
-    def missing(package, file):
-        raise PartError(f"{package} has no file {file}")
-
-    monkeypatch.setattr(doctor, "distribution_file", missing)
-    entry = files()["robots of rtb-data"]
-    assert (entry.status, "parts lack their file: rtb-data has no" in entry.text) == ("error", True)
 
 
 def test_an_error_that_a_package_made_of_ctrl_c_ends_the_diagnosis():
