@@ -31,7 +31,7 @@ from morphgen.model.kinematics import joint_limits
 from morphgen.tasks import renderer
 from morphgen.viewer import robot_files
 from morphgen.viewer.app.address import MAX_CHOSEN, Address, parse_address
-from morphgen.viewer.app.frame import page_links, shown_address, tray_html
+from morphgen.viewer.app.frame import shown_address, tray_html
 from morphgen.viewer.robot_files import joint_sweep, joint_titles, robot_page
 
 ADDRESS = re.compile(rb"""(?:src|href)=["'](?!data:)[^"']+["']""")
@@ -131,28 +131,6 @@ def test_a_page_opens_without_a_network(chromium, page, tmp_path):
 
 
 A, B = "words:arm=ur5 ee=plane", "robots/prims/prims-000001"
-
-
-def targets(address, chosen=()):
-    return {label: target.query for label, target in page_links(address, chosen).items()}
-
-
-def test_links_of_the_bar_keep_the_subject_of_the_page():
-    of_set = targets(Address("gallery", ("robots/prims",)))
-    assert of_set["Population"] == "?population=robots/prims"
-    of_robot = targets(Address("robot", (B,)))
-    assert of_robot["Gallery"] == "?gallery=robots/prims"
-    assert of_robot["Playback"] == f"?play=reach&robot={B}"
-    of_words = targets(Address("robot", (A,)))
-    assert of_words["Compose"] == "?compose=arm=ur5%20ee=plane"
-    assert targets(Address("split", ("mine",)))["Population"] == "?population=mine"
-    assert targets(Address("library"))["Compare"] == "?compare="
-
-
-def test_links_of_the_bar_take_the_chosen_robots():
-    links = targets(Address("robot", ("robots/x",)), [A, B])
-    assert links["Compare"] == "?compare=words:arm=ur5%20ee=plane&compare=" + B
-    assert links["Playback"].count("robot=") == 2
 
 
 def test_the_tray_offers_what_its_robots_can_do():

@@ -18,18 +18,9 @@ from importlib.resources import files
 from websockets.http11 import Response
 
 from morphgen.viewer.app.address import CHOSEN, MAX_COMPARED, MAX_PLAYED, Address
-from morphgen.viewer.robot_uri import (
-    DEFAULT_WORDS,
-    DERIVATION,
-    MEMBER,
-    WORDS,
-    member_split,
-    parent_folder,
-    uri_name,
-)
+from morphgen.viewer.robot_uri import DEFAULT_WORDS, uri_name
 
 _BEFORE = b'<div id="root">'
-_SET_PAGES = ("gallery", "population")  # pages whose subject is a set, a folder or a split
 
 
 def frame_page(response: Response) -> None:
@@ -44,7 +35,7 @@ def frame_page(response: Response) -> None:
 def _frame() -> bytes:
     """Return the frame with the bar of the first page, which is there before a page is built."""
     text = files("morphgen.viewer").joinpath("frame.html").read_text(encoding="utf-8")
-    links = bar_html(Address("library"), (), dark=False)
+    links = bar_html(Address("library"), dark=False)
     return text.replace('"pages">', f'"pages">{links}', 1).encode()
 
 
@@ -63,40 +54,24 @@ def call(function: str, *arguments: object) -> str:
     return f"window.morphgen?.{function}({', '.join(map(json.dumps, arguments))});"
 
 
-def page_links(address: Address, chosen: Sequence[str]) -> dict[str, Address]:
-    """Return the top bar's links by label; each keeps what the current page is about."""
-    uri = address.subject if address.page in ("robot", "compare") else ""
-    robots = tuple(chosen) or ((uri,) if uri else ())
-    folder, split = _surroundings(address)
-    is_derived = address.page == "robot" and uri.startswith((WORDS, DERIVATION, MEMBER))
-    return {
-        "Library": Address("library"),
-        "Gallery": Address("gallery", (folder,)),
-        "Population": Address("population", (split or folder,)),
-        "Compose": Address("compose", (uri.removeprefix(WORDS) if is_derived else DEFAULT_WORDS,)),
-        "Compare": Address("compare", robots[:MAX_COMPARED] or ("",)),
-        "Splits": Address("split", (split,)),
-        "Playback": Address("play", ("reach",), robots=robots[:MAX_PLAYED]),
-    }
+_LINKS = {
+    "Library": Address("library"),
+    "Gallery": Address("gallery"),
+    "Population": Address("population"),
+    "Compose": Address("compose", (DEFAULT_WORDS,)),
+    "Compare": Address("compare"),
+    "Splits": Address("split"),
+    "Playback": Address("play", ("reach",)),
+}
+"""The links of the top bar by label."""
 
 
-def _surroundings(address: Address) -> tuple[str, str]:
-    """Return the folder and the split of a page's robots; empty texts if there are none."""
-    subject = address.subject
-    if address.page == "split":
-        return "", subject
-    if address.page in _SET_PAGES:
-        return subject, ""
-    uri = subject if address.page in ("robot", "compare") else "".join(address.robots[:1])
-    return parent_folder(uri), member_split(uri)
-
-
-def bar_html(address: Address, chosen: Sequence[str], *, dark: bool) -> str:
+def bar_html(address: Address, *, dark: bool) -> str:
     """Return the content of the top bar."""
     links = "".join(
         f'<a href="{escape(target.query)}"'
         f"{' class=current' if target.page == address.page else ''}>{label}</a>"
-        for label, target in page_links(address, chosen).items()
+        for label, target in _LINKS.items()
     )
     theme = "light" if dark else "dark"
     switch = escape(address.with_state(theme=theme).query)

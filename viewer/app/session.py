@@ -227,7 +227,7 @@ class Session:
         """Show the address in the browser's URL and top bar, and a title in its tab."""
         self.title = title
         address = shown_address(self.address, self.chosen).with_state(tab=self.tabs)
-        bar = bar_html(self.address.with_state(tab=self.tabs), self.chosen, dark=self.dark)
+        bar = bar_html(self.address.with_state(tab=self.tabs), dark=self.dark)
         self.run_script(
             call("address", self.visit, address.query, title) + call("bar", bar, self.dark)
         )
