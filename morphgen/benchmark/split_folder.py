@@ -71,43 +71,6 @@ _SUM = re.compile(r"([0-9a-f]{64})  (.+)")
 Record = dict[str, Any]  # a line of `robots.jsonl`
 
 
-@dataclass(frozen=True, eq=False)
-class SplitFolder:
-    """The content of a split folder."""
-
-    folder: Path
-    robots: tuple[Record, ...]
-    """All robots, train robots first, under the keys of ``robots.jsonl``, and ``tokens``, shape
-    (max_links, 48), and ``mask``, shape (max_links,). The bundle of a robot is
-    ``folder / robot["path"]``."""
-    tokens: NDArray[np.float64]
-    """Tokens at home, in the order of ``robots``, shape (n, max_links, 48)."""
-    mask: NDArray[np.bool_]  # True for the rows of tokens that are links, shape (n, max_links)
-
-    @property
-    def train(self) -> tuple[Record, ...]:
-        """The train robots."""
-        return tuple(robot for robot in self.robots if robot["side"] == "train")
-
-    @property
-    def test(self) -> tuple[Record, ...]:
-        """The test robots."""
-        return tuple(robot for robot in self.robots if robot["side"] == "test")
-
-
-def load_split_folder(folder: str | Path) -> SplitFolder:
-    """Read a folder that ``morphgen split build`` wrote, without its bundles."""
-    folder = Path(folder)
-    require_split_folder(folder)
-    records = read_records(folder / ROBOTS_FILE)
-    names, tokens, mask = read_tokens(folder / TOKENS_FILE)
-    if names != [record["name"] for record in records]:
-        raise BenchmarkError(f"{folder}: {TOKENS_FILE} is not of the robots in {ROBOTS_FILE}")
-    for record, table, present in zip(records, tokens, mask, strict=True):
-        record["tokens"], record["mask"] = table, present
-    return SplitFolder(folder, tuple(records), tokens, mask)
-
-
 def require_split_folder(folder: Path) -> None:
     """Check that a folder is a finished split folder."""
     if not folder.is_dir():

@@ -17,7 +17,7 @@ from helpers.scenes import robot
 from helpers.splits import LIBRARY, TEST, TRAIN, member, split
 from morphgen.benchmark import release
 from morphgen.benchmark.release import verify, write_goals
-from morphgen.benchmark.split_folder import build_split, load_split_folder
+from morphgen.benchmark.split_folder import build_split, require_split_folder
 from morphgen.errors import BenchmarkError, MorphgenError, TaskError
 from morphgen.grammar.library import default_library
 from morphgen.progress import show_progress
@@ -320,7 +320,7 @@ def test_interrupted_build_is_not_marked_finished(home, cache, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             write_goals(home, member_sets, RECIPE)
     with pytest.raises(BenchmarkError, match="is not finished"):
-        load_split_folder(home)
+        require_split_folder(home)
     build_split(mixed(), home.parents[1], LIBRARY)
     write_goals(home, member_sets, RECIPE)
     assert verify(home, LIBRARY).differences == ()
