@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TypeAlias
 
 from morphgen.checks import check
 from morphgen.cli import options as opt
@@ -42,12 +39,8 @@ COLUMNS = {
 """Headers of the table of fits, and how their numbers are written."""
 
 
-Target: TypeAlias = tuple[RobotReference | None, Robot]
-"""A robot to which primitives are fitted, and where it is from; None for a part or a mesh alone."""
-
-
 def fit(args: argparse.Namespace) -> None:
-    """Fit, print the table and write bundles."""
+    """Fit, print the table and write a bundle."""
     if args.all == bool(args.words):
         raise MorphgenError("name a part, a robot or a mesh file, or say --all")
     options = FitOptions(**opt.given(args, (each.name for each in fields(FitOptions))))
@@ -57,34 +50,21 @@ def fit(args: argparse.Namespace) -> None:
         for path in track(paths, args, "fitting", "part", len(parts)):
             print_line(str(path))
         return
-    targets = _targets(args)
-    if args.out:
-        _require_own_names(targets)
-    results = []
-    for target in targets:
-        folder = _folder(args, *target, several=len(targets) > 1) if args.out else None
-        if len(targets) > 1 and not args.json:
-            print(f"{target[1].name}:")
-        results.append(_fit_robot(target, folder, options, args))
-    if args.json:
-        print(json.dumps(results if len(results) > 1 else results[0]))
+    source, robot = _target(args)
+    folder = _folder(args.out, source) if args.out else None
+    with bar(args, f"fitting {source.label if source else robot.name}", "link"):
+        fit = fit_robot(robot, options, opt.library_of(args).folders, jobs=args.jobs)
+    opt.print_result(args, fit.report.as_dict(), lambda: _report_text(fit.report))
+    if folder is not None:
+        fitted = replace(fit.robot, name=folder.name)  # a bundle's folder has its robot's name
+        findings = check(fitted, tool_required=source is not None)
+        write_bundle(fitted, folder, findings, picture=not args.no_picture)
+        if not args.json:
+            print(folder)
 
 
-def _require_own_names(targets: Sequence[Target]) -> None:
-    """Require that no two robots have one name, which is that of their folder."""
-    labels: dict[str, str] = {}
-    for source, robot in targets:
-        label = source.label if source else robot.name
-        other = labels.setdefault(robot.name, label)
-        if other != label:  # one robot may be named twice
-            raise FormatError(
-                f"{label} and {other} are both named {robot.name!r}; fit them one at a time, into "
-                "folders of their own"
-            )
-
-
-def _targets(args: argparse.Namespace) -> list[Target]:
-    """Return what the arguments name: a part, a mesh file, or robots."""
+def _target(args: argparse.Namespace) -> tuple[RobotReference | None, Robot]:
+    """Return what the arguments name: a part or a mesh file, which have no source, or a robot."""
     library = opt.library_of(args)
     word = args.words[0]
     is_mesh = Path(word).suffix.lower() in MESH_SUFFIXES
@@ -92,46 +72,21 @@ def _targets(args: argparse.Namespace) -> list[Target]:
         if args.root is not None:
             raise MorphgenError(f"--root {args.root}: only with a bundle or a description")
         if is_mesh:
-            return [(None, mesh_robot(Path(word)))]
-        return [(None, load_part(library.manifest(word)).fragment)]
-    return list(opt.read_robots(args))
+            return None, mesh_robot(Path(word))
+        return None, load_part(library.manifest(word)).fragment
+    return opt.read_one_robot(args)
 
 
-def _folder(
-    args: argparse.Namespace, source: RobotReference | None, robot: Robot, *, several: bool
-) -> Path:
+def _folder(out: Path, source: RobotReference | None) -> Path:
     """Return the folder of the bundle."""
-    parent, name = (args.out, robot.name) if several else (args.out.parent, args.out.name)
-    folder = bundle_folder(parent, name)
+    folder = bundle_folder(out.parent, out.name)
     if source is not None and source.path is not None:
         path = source.path.resolve()
         # A robot may be named by its bundle, or by a file in it.
         if folder.resolve() in (path, path.parent):
-            raise FormatError(f"--out {args.out} is the robot itself; name another folder")
+            raise FormatError(f"--out {out} is the robot itself; name another folder")
     require_replaceable(folder)
     return folder
-
-
-def _fit_robot(
-    target: Target, folder: Path | None, options: FitOptions, args: argparse.Namespace
-) -> dict[str, object]:
-    """Fit one robot, write its bundle if a folder is given, and return the data of ``--json``."""
-    source, robot = target
-    folders = opt.library_of(args).folders
-    with bar(args, f"fitting {source.label if source else robot.name}", "link"):
-        fit = fit_robot(robot, options, folders, jobs=args.jobs)
-    report = fit.report
-    if not args.json:
-        with opt.fit_terminal(args):
-            print(_report_text(report))
-    if folder is None:
-        return report.as_dict()
-    fitted = replace(fit.robot, name=folder.name)  # a bundle's folder has the name of its robot
-    findings = check(fitted, tool_required=source is not None)
-    write_bundle(fitted, folder, findings, picture=not args.no_picture)
-    if not args.json:
-        print(folder)
-    return report.as_dict()
 
 
 def _report_text(report: FitReport) -> str:

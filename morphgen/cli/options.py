@@ -12,8 +12,14 @@ from contextlib import AbstractContextManager
 from inspect import signature
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from morphgen.cli.progress import note, track
-from morphgen.errors import BenchmarkError, FormatError, MorphgenError, one_line
+from morphgen.cli.progress import note, status, track
+from morphgen.errors import (
+    BenchmarkError,
+    CompositionError,
+    FormatError,
+    MorphgenError,
+    one_line,
+)
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.findings import Finding
 from morphgen.tables import fitted
@@ -92,6 +98,19 @@ def read_robots(args: argparse.Namespace) -> list[tuple[RobotReference, Robot]]:
         (source, read_source(source, library, args.root))
         for source in track(sources, args, "reading", "robot", len(sources))
     ]
+
+
+def read_one_robot(args: argparse.Namespace) -> tuple[RobotReference, Robot]:
+    """Return the robot that the arguments name, which must be one, with its source."""
+    from morphgen.grammar.robot_source import read_source
+
+    source, *others = sources_of(args)
+    if others:
+        raise CompositionError(
+            f"{' '.join(args.words)}: {len(others) + 1} robots; name one, such as {source.label}"
+        )
+    with status(args, f"reading {source.label}"):
+        return source, read_source(source, library_of(args), args.root)
 
 
 def for_each_robot(

@@ -11,7 +11,7 @@ from typing import TypeAlias
 from morphgen.checks import check
 from morphgen.cli import options as opt
 from morphgen.cli.progress import bar, status
-from morphgen.errors import CompositionError, FormatError
+from morphgen.errors import FormatError
 from morphgen.formats.bundle import CARD, URDF, bundle_folder, find_description, write_bundle
 from morphgen.formats.data_files import read_json
 from morphgen.grammar.compose import compose as compose_parts
@@ -72,15 +72,7 @@ def show(args: argparse.Namespace) -> None:
 
         print_summary(args, demos(args.words[0]))
         return
-    from morphgen.grammar.robot_source import read_source
-
-    sources = opt.sources_of(args)
-    if len(sources) > 1:
-        raise CompositionError(
-            f"{' '.join(args.words)}: {len(sources)} robots; name one, such as {sources[0].label}"
-        )
-    with status(args, f"reading {sources[0].label}"):
-        robot = read_source(sources[0], opt.library_of(args), args.root)
+    _, robot = opt.read_one_robot(args)
     opt.print_result(args, _facts(robot), lambda: _tree(robot))
 
 

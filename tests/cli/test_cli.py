@@ -187,9 +187,6 @@ def test_robots_of_one_name_are_not_written_over_each_other(run, tmp_path):
     code, _, err = run("check", "a.urdf", "b.urdf", "--fix", "mended")
     assert code == 2
     assert "b.urdf: mended/arm is that of a.urdf, which has the same name" in err
-    code, _, err = run("fit", "a.urdf", "b.urdf", "--out", "fitted")
-    assert (code, (tmp_path / "fitted").exists()) == (2, False)
-    assert "b.urdf and a.urdf are both named 'arm'" in err
 
 
 def test_import_converts_a_urdf_to_a_bundle(ok, robot_urdf, tmp_path):
