@@ -29,12 +29,6 @@ def fitted(width: int | None) -> Iterator[None]:
         _width.reset(token)
 
 
-def fits(text: str) -> bool:
-    """Return whether a text is not wider than the terminal for which this block prints, if any."""
-    width = _width.get()
-    return width is None or _width_of(text) <= width
-
-
 def table(
     rows: Sequence[Sequence[object]],
     headers: Sequence[str],

@@ -18,12 +18,7 @@ from morphgen.encoding.similarity import (
     similarity_matrix,
     to_distances,
 )
-from morphgen.encoding.tokens import (
-    LAYOUT,
-    default_max_links,
-    require_max_links,
-    tokens_npz,
-)
+from morphgen.encoding.tokens import LAYOUT, default_max_links, tokens_npz
 from morphgen.encoding.tokens import tokens as encode
 from morphgen.errors import BenchmarkError
 from morphgen.fitting.token_shapes import token_shapes
@@ -31,11 +26,10 @@ from morphgen.formats.files import require_writable_file, write_file
 from morphgen.grammar.syntax import parse_derivation
 from morphgen.model.robot import Robot
 from morphgen.progress import part_of
-from morphgen.tables import fits, fitted, table
+from morphgen.tables import table
 from morphgen.typing import Array
 
 MEASURES = ("cosine", "tree", "workspace", "all")
-LARGEST_MATRIX = 20  # largest number of robots whose matrix is printed
 
 
 def similarity(args: argparse.Namespace) -> None:
@@ -78,7 +72,7 @@ def _features(args: argparse.Namespace) -> tuple[list[Features], list[str], list
     pairs, library = opt.read_robots(args), opt.library_of(args)
     if len(pairs) < 2:
         raise BenchmarkError(f"{pairs[0][0].label} is one robot; name others to compare it with")
-    max_links = _max_links(args, [robot for _, robot in pairs])
+    max_links = default_max_links(len(robot.links) for _, robot in pairs)
     computed = []
     for source, robot in track(pairs, args, "computing features", "robot", len(pairs)):
         try:
@@ -102,25 +96,10 @@ def _group(robot: Robot) -> str:
     return f"{words or 'imported'}, {robot.dof} DoF"
 
 
-def _max_links(args: argparse.Namespace, robots: Sequence[Robot]) -> int:
-    """Return the number of links that tokens are padded to.
-
-    It is the value of ``--max-links``, else the benchmark's or that of the largest robot if it has
-    more, such as a robot with two arms. All robots of a command share it.
-    """
-    if args.max_links is None:
-        return default_max_links(len(robot.links) for robot in robots)
-    for robot in robots:
-        require_max_links(len(robot.links), f"robot {robot.name!r}", args.max_links)
-    return int(args.max_links)
-
-
 def _text(names: Sequence[str], measure: str, values: Array) -> str:
     """Return the table of a measure with its title and statistics."""
     better = "larger" if get_measure(measure).larger_is_more_alike else "smaller"
-    rows = _matrix_table(names, values) if len(names) <= LARGEST_MATRIX else ""
-    if not rows or not fits(rows):
-        rows = _nearest_table(names, measure, values)
+    rows = _nearest_table(names, measure, values)
     pairs = values[np.triu_indices(len(values), 1)]  # the matrix is symmetric: each pair once
     low, median, high = np.percentile(pairs, (0, 50, 100))
     return (
@@ -128,13 +107,6 @@ def _text(names: Sequence[str], measure: str, values: Array) -> str:
         f"{len(pairs)} pairs: mean {pairs.mean():.3f}, median {median:.3f}, "
         f"from {low:.3f} to {high:.3f}"
     )
-
-
-def _matrix_table(names: Sequence[str], values: Array) -> str:
-    rows = [(i, name, *row) for i, (name, row) in enumerate(zip(names, values, strict=True))]
-    titles = ("#", "robot", *map(str, range(len(names))))
-    with fitted(None):  # a part of a matrix says little
-        return table(rows, titles, formats=".3f")
 
 
 def _nearest_table(names: Sequence[str], measure: str, values: Array) -> str:
@@ -149,51 +121,25 @@ def _nearest_table(names: Sequence[str], measure: str, values: Array) -> str:
 
 
 def tokens(args: argparse.Namespace) -> None:
-    """Print the tokens of the robots, or write those of one."""
-    if not args.words:
-        if not args.layout or args.out or args.max_links is not None:
-            raise BenchmarkError("name a robot, such as arm=ur5 ee=plane, or say --layout alone")
-        opt.print_result(args, _layout_data(), _layout_text)
-        return
+    """Print the tokens of a robot, or write them."""
     if args.out:
         require_writable_file(args.out, "--out", ".npz")
-    robots, folders = [robot for _, robot in opt.read_robots(args)], opt.library_of(args).folders
-    if args.out and len(robots) > 1:
-        raise BenchmarkError(f"--out {args.out}: {len(robots)} robots are named; expected one")
-    max_links = _max_links(args, robots)
-    tables = [
-        encode(robot, token_shapes(robot, folders), max_links=max_links)
-        for robot in track(robots, args, "computing tokens", "robot", len(robots))
-    ]
-    data = [_data(*pair, max_links) for pair in zip(robots, tables, strict=True)]
-    if args.out:
-        names = [link.name for link in robots[0].links]
-        write_file(args.out, tokens_npz(tables[0], names, robots[0].name, max_links))
-        data[0]["file"] = str(args.out)
-
-    def text() -> str:
-        lines = [f"{robot.name}: tokens {t.shape}" for robot, t in zip(robots, tables, strict=True)]
-        lines.append(f"\n{_layout_text()}" if args.layout else "tokens --layout has the fields")
-        return "\n".join([*lines, str(args.out)] if args.out else lines)
-
-    opt.print_result(args, data[0] if len(data) == 1 else data, text)
-
-
-def _data(robot: Robot, tokens: Array, max_links: int) -> dict[str, object]:
-    return {
+    _, robot = opt.read_one_robot(args)
+    max_links = args.max_links or default_max_links([len(robot.links)])
+    with bar(args, "computing tokens", "link"):
+        shapes = token_shapes(robot, opt.library_of(args).folders)
+    numbers = encode(robot, shapes, max_links=max_links)
+    links = [link.name for link in robot.links]
+    data = {
         "name": robot.name,
-        "links": [link.name for link in robot.links],
+        "links": links,
         "max_links": max_links,
-        "shape": list(tokens.shape),
-        "layout": _layout_data(),
-        "tokens": tokens.tolist(),
+        "shape": list(numbers.shape),
+        "layout": [asdict(field) for field in LAYOUT],
+        "tokens": numbers.tolist(),
     }
-
-
-def _layout_text() -> str:
-    rows = [(f.name, f"{f.start}:{f.columns.stop}", f.size, f.content) for f in LAYOUT]
-    return table(rows, ("field", "columns", "size", "content"))
-
-
-def _layout_data() -> list[dict[str, object]]:
-    return [asdict(field) for field in LAYOUT]
+    lines = [f"{robot.name}: tokens {numbers.shape}", "--json has the numbers and their fields"]
+    if args.out:
+        write_file(args.out, tokens_npz(numbers, links, robot.name, max_links))
+        data["file"] = lines[1] = str(args.out)
+    opt.print_result(args, data, lambda: "\n".join(lines))

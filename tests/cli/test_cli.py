@@ -61,7 +61,6 @@ def test_list_prints_one_row_per_part(ok):
         ["split", "list"],
         ["grammar", "list"],
         ["conform", "gantry-plane", "--samples", "2"],
-        ["tokens", "--layout"],
     ],
 )
 def test_tables_fit_the_terminal(words, ok, monkeypatch):

@@ -71,7 +71,6 @@ fit plane --spheres 4 --max-primitives 2 => --max-primitives: only without --sph
 fit --all --max-primitives 2 --seed 3 => --max-primitives --seed: only without --all
 fit plane --out .. => name
 fit plane --out file/made => cannot write to file: file is a file
-tokens => name a robot, such as arm=ur5 ee=plane, or say --layout
 tokens plane --out x.txt => --out x.txt: expected a name that ends in .npz
 tokens plane --out no/x.npz => --out no/x.npz: there is no folder no
 similarity folder plane => folder holds no robot; expected a bundle, a URDF, a set
