@@ -22,13 +22,7 @@ from morphgen.grammar.grammar_file import Grammar, find_grammar, load_grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import MOUNT_YAW
 from morphgen.grammar.part import load_part
-from morphgen.grammar.syntax import (
-    MAX_COUNT,
-    MAX_FAULTS,
-    MAX_PARTS,
-    Alternative,
-    Item,
-)
+from morphgen.grammar.syntax import MAX_COUNT, MAX_FAULTS, Alternative, Item
 
 _MANY = MAX_COUNT + 1  # stands for any larger number of structures
 
@@ -59,28 +53,6 @@ def _let_values(grammar: Grammar, draw: values.Draw) -> dict[str, tuple[float, s
     for let in grammar.lets:
         names[let.name] = values.evaluate(let.expression, values.Scope(names, draw, ""))
     return names
-
-
-def _is_too_large(start: str, possible: Mapping[str, Sequence[Alternative]]) -> bool:
-    """Return whether all robots of a symbol have too many parts, or are nested too deeply."""
-    most = MAX_PARTS + 2  # stands for any larger number
-    fewest = dict.fromkeys(possible, (most, most))  # parts and levels of each symbol
-    before: dict[str, tuple[int, int]] = {}
-    while fewest != before:  # fixed-point iteration, as symbols may be recursive
-        before = dict(fewest)
-        for symbol in reversed([*possible]):  # most are defined after their use
-            parts, levels = [most], [most]
-            for alternative in possible[symbol]:
-                sizes = [
-                    ((item.repetition or (1, 1))[0] * n, depth + 1)
-                    for item in alternative.items
-                    for n, depth in [fewest.get(item.name, (1, 0))]
-                ]
-                parts.append(sum(n for n, _ in sizes))
-                levels.append(max(depth for _, depth in sizes))
-            fewest[symbol] = (min(parts), min(levels))
-    num_parts, num_levels = fewest[start]
-    return num_parts > MAX_PARTS or num_levels > MAX_PARTS + 1  # parts are a level of their own
 
 
 def _symbol_graph(
@@ -262,9 +234,6 @@ def _structure_faults(grammar: Grammar, library: Library) -> Iterator[str]:
             if item.name not in roots:
                 roots.add(item.name)
                 require_root(load_part(manifest, values))
-        if _is_too_large(grammar.start, alternatives):
-            limits = f"{MAX_PARTS} parts and {MAX_PARTS} levels"
-            yield f"{location}: found no structure of at most {limits}"
     except CompositionError as error:
         yield f"{location}: {error}"
     except GrammarError as error:

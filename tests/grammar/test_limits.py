@@ -16,7 +16,6 @@ from morphgen.grammar.grammar_file import grammar_text, load_grammar
 from morphgen.grammar.syntax import (
     MAX_COUNT,
     MAX_NESTING,
-    MAX_PARTS,
     parse_condition,
     parse_derivation,
 )
@@ -98,25 +97,6 @@ def test_ports_of_more_structures_than_can_be_listed_are_checked():
     (fault,) = check_grammar(grammar(*lines, "first -> slides | cube"), LIBRARY)
     assert fault == "g:1:16: nothing can be attached to 'cube': it has no port"
     assert time.process_time() - began < 0.5
-
-
-@pytest.mark.parametrize("last", ["a64 -> bead", "a64 -> bead | beam"])
-def test_a_grammar_with_only_too_large_robots_has_a_fault(last):
-    robot_grammar = grammar("robot -> slides a0", *DOUBLING, last)
-    assert check_grammar(robot_grammar, LIBRARY) == [
-        f"g:1:1: found no structure of at most {MAX_PARTS} parts and {MAX_PARTS} levels"
-    ]
-    with_cube = grammar("robot -> slides a0 | slides cube", *DOUBLING, last)
-    assert check_grammar(with_cube, LIBRARY) == []
-
-
-@pytest.mark.parametrize(("depth", "faults"), [(99, 0), (100, 1)])
-def test_a_grammar_with_only_too_deep_robots_has_a_fault(depth, faults):
-    lines = [f"a{i} -> a{i + 1} | a{i + 1} bead" for i in range(depth)]
-    robot_grammar = grammar("robot -> slides a0", *lines, f"a{depth} -> bead")
-    assert len(check_grammar(robot_grammar, LIBRARY)) == faults
-    if not faults:
-        assert derive(robot_grammar, LIBRARY, Chooser()).part == "slides"
 
 
 @pytest.mark.parametrize(
