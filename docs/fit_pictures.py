@@ -23,10 +23,10 @@ from tqdm import tqdm
 
 import morphgen
 from morphgen.fitting.link_fit import FitOptions
-from morphgen.fitting.replace_collision import stored_primitives, with_primitives
-from morphgen.fitting.robot_fit import COLLISION_OPTIONS, fit_links
+from morphgen.fitting.replace_collision import as_primitives, with_primitives
+from morphgen.fitting.robot_fit import fit_links
 from morphgen.formats.bundle import MJCF, split_colours, write_bundle
-from morphgen.formats.fits import are_primitives, read_stored_fits, shapes_key
+from morphgen.formats.fits import are_primitives, shapes_key
 from morphgen.formats.picture import render
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.geometry import Rgba, Shape
@@ -112,18 +112,13 @@ def _picture(name: str, library: Library, options: FitOptions | None) -> Image.I
 
 def _fitted(robot: Robot, library: Library) -> tuple[dict[str, tuple[Shape, ...]], list[float]]:
     """Return primitives by link, and the IoU of each link that has meshes."""
-    stored = read_stored_fits(library.folders)
-    primitives, missing = stored_primitives(robot, stored)
+    fitted = as_primitives(robot, library.folders)
     ious = [
-        stored[shapes_key(link.collisions)].collision_iou
-        for link in robot.links
-        if link.name in primitives and not are_primitives(link.collisions)
+        fitted.fits[shapes_key(new.collisions)].collision_iou
+        for old, new in zip(robot.links, fitted.links, strict=True)
+        if not are_primitives(old.collisions)
     ]
-    report = fit_links(robot, COLLISION_OPTIONS, only=missing)
-    for finding in report.findings:
-        tqdm.write(f"{robot.name}: {finding.where}: {finding.why}")
-    primitives |= {row.link: row.fit.primitives for row in report.links}
-    return primitives, ious + [row.fit.quality.iou for row in report.links]
+    return {link.name: link.collisions for link in fitted.links}, ious
 
 
 def _coloured(robot: Robot) -> Robot:

@@ -160,19 +160,6 @@ def _collisions(link: Link, shapes: Sequence[Shape] | None) -> tuple[Shape, ...]
     return tuple(shapes) if link.collisions else ()
 
 
-def stored_primitives(
-    robot: Robot, stored: StoredFits
-) -> tuple[dict[str, tuple[Shape, ...]], list[str]]:
-    """Return the known collision primitives by link name, and the links that have no known fit."""
-    fits = _known_fits(robot, stored)
-    primitives = {
-        link.name: fits[link.name].collision if has_meshes(link.collisions) else link.collisions
-        for link in robot.links
-        if link.name in fits or not has_meshes(link.collisions)
-    }
-    return primitives, [link.name for link in robot.links if link.name not in primitives]
-
-
 def _known_fits(robot: Robot, stored: StoredFits) -> dict[str, StoredFit]:
     """Return the fits that the robot carries or that are stored, by link name."""
     fits = {link.name: find_fit(link.collisions, robot, stored) for link in robot.links}

@@ -15,9 +15,8 @@ import viser
 from morphgen.checks import check
 from morphgen.checks.self_collision import SelfCollisionChecker
 from morphgen.errors import MorphgenError
-from morphgen.fitting.replace_collision import as_primitives, stored_primitives
+from morphgen.fitting.replace_collision import as_primitives
 from morphgen.formats.bundle import CARD, MJCF, URDF, file_findings, split_colours
-from morphgen.formats.fits import read_stored_fits
 from morphgen.model import kinematics
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import Pose, Shape
@@ -379,13 +378,9 @@ class Layers:
         """Draw the primitives fitted to the links; fits that are not stored are computed."""
         session, folders = self._session, self._session.files.library_folders
         robot = robot_uri.with_library_meshes(self._robot, session.files.library)
-        primitives, missing = stored_primitives(robot, read_stored_fits(folders))
-        if missing:
-            text = f"fitting primitives to {len(missing)} links; this takes a while"
-            with session.activity(text):
-                fitted = session.workers.call(as_primitives, robot, folders)
-            primitives = {link.name: link.collisions for link in fitted.links}
-        self._primitives = [primitives.get(link.name, ()) for link in robot.links]
+        with session.activity("fitting primitives, which takes a while unless they are stored"):
+            fitted = session.workers.call(as_primitives, robot, folders)
+        self._primitives = [link.collisions for link in fitted.links]
         session.enqueue(lambda: self._show_layer("primitives"))
 
     def _toggle_workspace(self, on: bool) -> None:
