@@ -290,7 +290,7 @@ def split(
               or ``any``); ``composition`` with ``robots``; ``extrapolation`` with
               ``train_category`` and ``test_category`` (grammars)
             - ``robots``: words of ``compose`` with choices in braces and wildcards, by default
-              ``arm=* ee=*``; ``grammar``: grammars to draw from
+              ``arm=* ee=*``
             - ``test``: number of test robots, by default 1; ``task``: by default ``reach``;
               ``obstacles``; ``seed``; ``max_links``, by default 23
             - ``jobs``: number of processes
@@ -328,7 +328,7 @@ _RULES: Mapping[Regime, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "interpolation": (("grammar",), ("hull",)),
     "composition": (("robots",), ()),
     "extrapolation": (("train_category", "test_category"), ()),
-    "hold-out": (("hold_out",), ("robots", "grammar")),
+    "hold-out": (("hold_out",), ("robots",)),
 }
 """Arguments that a regime needs, and further ones that have an effect."""
 MAX_WORD = 60  # largest number of characters of what is held out in the name of a split
@@ -418,8 +418,7 @@ def _choose(
             return composition(request, patterns, library, jobs=jobs)
         if regime == "extrapolation":
             return extrapolation(request, train, test, library, jobs=jobs)
-        held_out = rules["hold_out"]
-        return hold_out(request, held_out, library, patterns=patterns, grammars=grammars, jobs=jobs)
+        return hold_out(request, rules["hold_out"], library, patterns=patterns, jobs=jobs)
 
 
 def _several(key: str, names: Names) -> tuple[str, ...]:

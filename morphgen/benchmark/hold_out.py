@@ -18,9 +18,7 @@ from typing import TypeAlias
 
 from morphgen.benchmark.regimes import (
     MAX_COMPOSED,
-    MAX_DRAWS,
     NOTHING,
-    RobotStream,
     SplitRequest,
     assemble,
     found,
@@ -30,20 +28,18 @@ from morphgen.benchmark.regimes import (
 )
 from morphgen.encoding.similarity import is_near
 from morphgen.errors import BenchmarkError, nearest
-from morphgen.grammar.grammar_file import Grammar
 from morphgen.grammar.library import Library
 from morphgen.grammar.manifest import PART_KINDS, Manifest
 from morphgen.grammar.syntax import Derivation, parse_derivation
 from morphgen.model.findings import Finding
 from morphgen.processes import parallel_map
-from morphgen.progress import part_of, report, stage
+from morphgen.progress import part_of, stage
 from morphgen.splits.split import (
     HOLD_OUT,
     HOLD_OUT_KEY,
     Candidate,
     DerivedRecipe,
     RobotFactory,
-    SampledRecipe,
     Split,
     UnfitRobotError,
 )
@@ -175,9 +171,7 @@ STRATA = ("arm", "ee", "body", "base")
 class _Draft:
     """A robot that may be drawn; it is composed when it is."""
 
-    recipe: SampledRecipe | DerivedRecipe
-    derivation: Derivation
-    """Parts and values; those of a sampled robot may change when it is composed."""
+    recipe: DerivedRecipe
     rules: tuple[int, ...]
     """Numbers of the rules that hold for the robot; none if it may be trained on."""
     parts: frozenset[str]
@@ -196,9 +190,9 @@ class _DraftMaker:
     library: Library
     seed: int
 
-    def draft(self, recipe: SampledRecipe | DerivedRecipe, derivation: Derivation) -> _Draft:
-        """Return the draft of a derivation."""
-        library = self.library
+    def draft(self, recipe: DerivedRecipe) -> _Draft:
+        """Return the draft of a robot."""
+        library, derivation = self.library, recipe.derivation
         numbers = [n for n, rule in enumerate(self.rules) if rule.holds(derivation, library)]
         matching = (self.rules[n].matching_parts(derivation, library) for n in numbers)
         kinds: set[_Item] = {
@@ -207,7 +201,6 @@ class _DraftMaker:
         own_parts = parts(derivation)
         return _Draft(
             recipe,
-            derivation,
             tuple(numbers),
             own_parts,
             own_parts - held_out_parts(self.rules, derivation, library),
@@ -221,39 +214,14 @@ class _DraftMaker:
         )
 
 
-def _make_pool(
-    request: SplitRequest, maker: _DraftMaker, patterns: Sequence[str], grammars: Sequence[Grammar]
-) -> list[_Draft]:
+def _make_pool(maker: _DraftMaker, patterns: Sequence[str]) -> list[_Draft]:
     """Return every robot that may be drawn, each derivation once."""
     drafts: dict[str, _Draft] = {}
-    recipes = (recipe for pattern in patterns for recipe in pattern_robots(pattern, maker.library))
-    for draft in (
-        *(maker.draft(recipe, recipe.derivation) for recipe in recipes),
-        *_from_grammars(request, maker, grammars),
+    for recipe in (
+        recipe for pattern in patterns for recipe in pattern_robots(pattern, maker.library)
     ):
-        drafts.setdefault(str(draft.derivation), draft)
+        drafts.setdefault(str(recipe.derivation), maker.draft(recipe))
     return list(drafts.values())
-
-
-def _from_grammars(
-    request: SplitRequest, maker: _DraftMaker, grammars: Sequence[Grammar]
-) -> Iterator[_Draft]:
-    num_draws = max(MAX_DRAWS, 4 * (max(request.train) + request.test))  # many repeat
-    for i, grammar in enumerate(grammars):
-        stream = RobotStream.of(grammar, grammar.name, request)
-        known: set[str] = set()
-        num_repeated = 0  # draws since the last new derivation
-        for number in range(num_draws):
-            report(i * num_draws + number, len(grammars) * num_draws)
-            derivation = stream.derivation(number, maker.library)
-            if derivation is not None and (text := str(derivation)) not in known:
-                known.add(text)
-                num_repeated = 0
-                yield maker.draft(stream.recipe(number), derivation)
-                continue
-            num_repeated += 1
-            if num_repeated == MAX_DRAWS:  # the grammar has hardly any others
-                break
 
 
 def _stratified(
@@ -333,10 +301,8 @@ class _HoldOutSearch:
         for number, result in zip(unknown, results, strict=True):
             if isinstance(result, str):
                 self.rejected[number] = result
-                continue
-            self.robots[number] = result
-            # The conditions of a grammar may have replaced the derivation that was drawn.
-            self.pool[number] = self.maker.draft(self.pool[number].recipe, result.derivation)
+            else:
+                self.robots[number] = result
 
     def _choose(self) -> tuple[list[int], list[int]]:
         """Return the numbers of the best test and train robots that are not rejected."""
@@ -371,7 +337,7 @@ class _HoldOutSearch:
                 what += ", whose other parts can be trained," if option == "--test" else ""
                 raise BenchmarkError(
                     f"{option} {wanted}: {count} different robots {what} exist{self._reasons()}; "
-                    "ask for fewer, or name more robots with --from or --grammar"
+                    "ask for fewer, or name more robots with --from"
                 )
 
     def _require_all_rules(self, test: Sequence[int]) -> None:
@@ -380,7 +346,7 @@ class _HoldOutSearch:
             if not any(number in self.pool[n].rules for n in test):
                 raise BenchmarkError(
                     f"--hold-out {rule}: no robots with it, whose other parts can be trained, "
-                    f"exist{self._reasons()}; name more robots with --from or --grammar"
+                    f"exist{self._reasons()}; name more robots with --from"
                 )
 
     def _require_covered(self, test: Sequence[int], train: Sequence[int]) -> None:
@@ -499,7 +465,7 @@ def hold_out_findings(split: Split, library: Library) -> Iterator[Finding]:
             yield found("held-out-untested", f"rule {rule}")
 
 
-DEFAULT_PATTERN = "arm=* ee=*"  # robots that are drawn from if nothing is named
+DEFAULT_PATTERNS = ("arm=* ee=*",)  # robots that are drawn from if nothing is named
 
 
 def hold_out(
@@ -508,7 +474,6 @@ def hold_out(
     library: Library,
     *,
     patterns: Sequence[str] = (),
-    grammars: Sequence[Grammar] = (),
     jobs: int = 1,
 ) -> tuple[Split, ...]:
     """Return splits whose test robots have held-out parts, and whose train robots have none."""
@@ -518,24 +483,20 @@ def hold_out(
             f"--test {request.test}: {len(rules)} rules are held out, and each needs a test robot; "
             f"expected {len(rules)} or more"
         )
-    if not grammars and not patterns:
-        patterns = (DEFAULT_PATTERN,)
+    patterns = patterns or DEFAULT_PATTERNS
     maker = _DraftMaker(rules, library, request.seed)
     factory = RobotFactory(library, with_features=True, max_links=request.max_links)
     with stage("drawing"):
-        pool = dict(enumerate(_make_pool(request, maker, patterns, grammars)))
+        pool = dict(enumerate(_make_pool(maker, patterns)))
     search = _HoldOutSearch(request, maker, factory, pool)
     test, train = search.run(jobs)
     robots = [*train, *test]
     names = unique_names(robot.derivation for robot in robots)
     named = [replace(robot, name=name) for robot, name in zip(robots, names, strict=True)]
-    provenance: dict[str, object] = {HOLD_OUT_KEY: [str(rule) for rule in rules]}
-    if patterns:
-        provenance["from"] = list(patterns)
-    if grammars:
-        streams = [RobotStream.of(grammar, grammar.name, request) for grammar in grammars]
-        provenance["grammars"] = {grammar.name: grammar.digest for grammar in grammars}
-        provenance["seeds"] = {stream.prefix: stream.seed for stream in streams}
+    provenance: dict[str, object] = {
+        HOLD_OUT_KEY: [str(rule) for rule in rules],
+        "from": list(patterns),
+    }
     if search.rejected:
         provenance["left_out"] = dict(sorted(Counter(search.rejected.values()).items()))
     summary = f"{{n}} robots without {' or '.join(map(str, rules))}; test: {request.test} with it"

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 
-from helpers.grammars import grammar
 from helpers.splits import LIBRARY, member, order, split
 from morphgen.benchmark.hold_out import (
     hold_out,
@@ -19,7 +18,6 @@ from morphgen.benchmark.survey import audit
 from morphgen.errors import BenchmarkError, CompositionError, PartError
 from morphgen.grammar.request import parse_words
 from morphgen.grammar.syntax import parse_derivation
-from morphgen.progress import show_progress
 from morphgen.splits.split import (
     Member,
     RobotFactory,
@@ -37,10 +35,9 @@ PRIMITIVE = f"arm={{{','.join(ARMS)}}} ee={{{','.join(EES)}}}"
 """Twenty robots without meshes, which are fast to compose."""
 
 
-def made(rules, *train, patterns=(PRIMITIVE,), grammars=(), **changes):
+def made(rules, *train, patterns=(PRIMITIVE,), **changes):
     """Return the largest split of a request."""
-    sources = {"patterns": patterns, "grammars": grammars}
-    return hold_out(order(*train, **changes), rules, LIBRARY, **sources)[-1]
+    return hold_out(order(*train, **changes), rules, LIBRARY, patterns=patterns)[-1]
 
 
 def part_counts(members, kind):
@@ -95,32 +92,6 @@ def test_both_parts_of_a_held_out_pair_are_trained():
         assert test.name == "lwr+plane"
         assert "lwr" in part_counts(example.train, "arm")
         assert "plane" in part_counts(example.train, "ee")
-
-
-def test_draws_from_a_grammar_are_stratified_over_its_parts():
-    rare = grammar(
-        "robot -> arm ee",
-        "arm -> @weight(50) arm3 | lwr | arm_ed",
-        "ee -> plane(size=uniform(0.05, 0.2)) | cube(size=uniform(0.05, 0.2))",
-    )
-    example = made(["arm=lwr"], 4, test=2, patterns=(), grammars=[rare])
-    require_sound(example, ["arm=lwr"])
-    assert part_counts(example.train, "arm") == {"arm3": 2, "arm_ed": 2}
-    assert part_counts(example.train, "ee") == {"plane": 2, "cube": 2}
-    assert example.train[0].category == "g"
-
-
-def test_drawing_is_reported_and_ends_when_a_grammar_has_no_others():
-    few = grammar("robot -> arm plane(size=choice(0.1, 0.2))", "arm -> arm3 | lwr | arm_ed")
-    require_sound(made(["arm=lwr"], 4, test=2, patterns=(), grammars=[few]), ["arm=lwr"])
-    reports = []
-    with (
-        show_progress(lambda done, total: reports.append((done, total))),
-        pytest.raises(BenchmarkError, match=r"--train 100000: only 4 different robots without"),
-    ):
-        made(["arm=lwr"], 100_000, test=2, patterns=(), grammars=[few])
-    assert reports[0] == (0, 400_008)
-    assert len(reports) < 2500
 
 
 def test_the_same_body_of_two_parts_is_drawn_once(monkeypatch):

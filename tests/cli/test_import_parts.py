@@ -75,7 +75,8 @@ def test_bodies_become_parts_of_a_split(ok, tmp_path):
     assert {path.name for path in (tmp_path / "parts").iterdir()} == {"body_1.yaml", "body_2.yaml"}
     (tmp_path / "set.grammar").write_text("robot -> body_1 | body_2\n")
     words = ("--library", "parts", "--train", "1", "--test", "1", "--name", "my/set")
-    ok("split", "new", "--grammar", "set.grammar", "--hold-out", "body=body_2", *words)
+    bodies = "set.grammar robot={body_1,body_2}"
+    ok("split", "new", "--from", bodies, "--hold-out", "body=body_2", *words)
     assert "body_2" in (tmp_path / "my" / "set.yaml").read_text()
 
 

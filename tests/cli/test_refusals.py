@@ -94,7 +94,6 @@ EXTRAPOLATION stick, --test-category chain => unknown grammar ''
 CUBES --train 3,x => argument --train: x: expected a whole number, 1 or more
 CUBES --train '' => --train and --test start at 1
 CUBES --out file/x.yaml => cannot write file/x.yaml: 
-HOLD_OUT --grammar arm33 => 'arm33'; did you mean 'arm3'?
 HOLD_OUT --name ../x => name '../x': use letters, digits
 HOLD_OUT composition --from ee=plane => --hold-out before composition: options stand after it
 split new --seed 5 composition => --seed before composition: options stand after it
