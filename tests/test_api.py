@@ -238,7 +238,6 @@ make_env("reach", num_envs=2, config=3) => int is not the config of reach
 make_env("reach", num_envs=2, autoreset_mode="NextStep") => unknown option 'autoreset_mode'
 prims_env(num_envs=0) => 0 environments
 export("prims", "gltf") => unknown format 'gltf'; did you mean 'glb'
-export("prims", "gif", dark=True) => dark: only with format html
 train("prims") => prims: no such file, and no split of this name
 train("prims task=reach", steps="9") => steps '9': expected a whole number, 1
 train("prims task=reach", sim="mujco") => did you mean 'mujoco'

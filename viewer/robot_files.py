@@ -139,18 +139,18 @@ def scene_server() -> Iterator[viser.ViserServer]:
         stop_server(server)
 
 
-def robot_page(robot: Robot, dark: bool = False) -> bytes:
+def robot_page(robot: Robot) -> bytes:
     """Return a web page of a robot that moves its joints in turn, with slider and space bar."""
     robot = split_colours(robot)
     low, high = robot_bounds(robot)
     with scene_server() as server:
-        set_stage(server.scene, dark=dark)
+        set_stage(server.scene, dark=False)
         add_ground(server.scene, float(np.linalg.norm(high - low)))
         view = add_robot(server.scene, robot, "/robot")
         low, high = sweep_bounds(robot)
         place_camera(server.initial_camera, low, high)
         if not robot.dof:
-            return web_page(server.get_scene_serializer(), robot.name, dark=dark)
+            return web_page(server.get_scene_serializer(), robot.name, dark=False)
         top = (float(low[0] + high[0]) / 2, float(low[1] + high[1]) / 2, float(high[2]))
         label = server.scene.add_label("/joint", "home", position=top, anchor="top-center")
         recording = server.get_scene_serializer()
@@ -160,7 +160,7 @@ def robot_page(robot: Robot, dark: bool = False) -> bytes:
             for q in joint_sweep(robot, column, round(_JOINT_TIME / _FRAME_TIME)):
                 view.set_configuration(q)
                 recording.insert_sleep(_FRAME_TIME)
-        return web_page(recording, robot.name, dark=dark)
+        return web_page(recording, robot.name, dark=False)
 
 
 def joint_sweep(robot: Robot, column: int, n: int) -> Array:

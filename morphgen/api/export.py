@@ -56,7 +56,6 @@ def export(
     format: str = "html",
     out: str | PathLike[str] | None = None,
     *,
-    dark: bool = False,
     library: LibraryFolders = (),
 ) -> Path:
     """Write a robot for other tools, as a web page, or as a video in which it turns.
@@ -71,14 +70,13 @@ def export(
             ``mjcf``, ``sdf``, ``curobo``, ``usd`` or ``ros2``.
         out: Output folder; by default the robot's bundle for a file, its parent for a folder, and
             the current folder for other robots.
-        dark: Whether an ``html`` page is dark.
         library: Folders of your own parts.
 
     Returns:
         The file or folder. An existing folder is replaced only if all its files are of an export.
 
     Raises:
-        FormatError: If the format is unknown, or an argument has no effect on it.
+        FormatError: If the format is unknown.
         MissingDependencyError: If the extra that the format needs is not installed.
         MorphgenError: If the robot cannot be read or written.
     """
@@ -86,8 +84,6 @@ def export(
     given.out = None if out is None else path_argument("out", out, FormatError)
     if text_argument("format", format, FormatError) not in (valid := (*FILES, *FOLDERS)):
         raise FormatError(f"unknown format {format!r}{nearest(format, valid)}")
-    if dark and format != "html":
-        raise FormatError("dark: only with format html")
     parts, source = default_library(library), None
     if not isinstance(robot, Robot):
         source = find_robot(robot)
@@ -138,7 +134,7 @@ def _target(source: RobotReference | None, robot: Robot, given: SimpleNamespace)
 def _html(robot: Robot, given: SimpleNamespace) -> bytes:
     from morphgen.viewer.robot_files import robot_page  # of an extra, and seconds to import
 
-    return robot_page(robot, dark=given.dark)
+    return robot_page(robot)
 
 
 def _video(robot: Robot, given: SimpleNamespace) -> bytes:

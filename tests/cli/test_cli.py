@@ -400,11 +400,11 @@ def test_bundles_get_their_web_page_and_stay_valid(ok, tmp_path):
 
 
 def test_other_robots_are_written_into_the_output_folder(ok, tmp_path):
-    out = ok("export", "base=planar", "ee=cube", "--out", tmp_path, "--dark")
+    out = ok("export", "base=planar", "ee=cube", "--out", tmp_path)
     (path,) = tmp_path.iterdir()
     assert out.strip() == str(path)
     assert path.suffix == ".html"
-    assert b"darkMode:true" in path.read_bytes()
+    assert b"__VISER_EMBED_DATA__" in path.read_bytes()
 
 
 def files(folder):

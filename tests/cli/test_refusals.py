@@ -56,7 +56,6 @@ import a.xml --parts parts => --parts: only with --part
 import a.xml --part arm --licence MIT --name 1st => digits and underscores, no digit first; import
 import a.xml --part ee --licence MIT => no frame 'tool', which is the flange or the tool of a
 import a.xml --part arm --licence MIT --tool left --name z1 => morphgen has a part of this name;
-export prims --format gif --dark => --dark: only with --format html
 export arm3-stick --format curobo => (morphgen fit ROBOT --spheres N --out DIR), and export DIR
 export prims --out /dev/null => cannot write to /dev/null: /dev/null is a file
 export prims --format sfd => invalid choice: 'sfd'; did you mean 'sdf'?
