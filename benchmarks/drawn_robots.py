@@ -29,7 +29,7 @@ from morphgen.rl.ppo import Learner
 from morphgen.rl.runs import robot_source as drawn_robots
 from morphgen.rl.runs.checkpoint import RunConfig
 from morphgen.rl.runs.robot_source import GrammarSource, draw, drawn_source
-from morphgen.rl.runs.training import SLICE_STEPS, TrainingBatches, use_batch
+from morphgen.rl.runs.training import SLICE_STEPS, TrainingBatches
 from morphgen.tasks.scenes.env_specs import GoalConfig, default_configs
 from morphgen.tasks.task import TaskConfig
 
@@ -91,7 +91,7 @@ def measure_slice(
     learner = Learner(batches.make(0), policy, ppo, least_links=batches.most_links)
     learner.iterate()
     start = time.process_time()
-    use_batch(learner, batches.make(updates))
+    learner.use(batches.make(updates))
     built = time.process_time() - start
     for _ in range(updates):
         learner.iterate()

@@ -51,7 +51,6 @@ class PolicyConfig:
 
     def __post_init__(self) -> None:
         """Check, and fill in the sizes of the networks."""
-        config = AGENTS[self.agent].config
         observation_config(self.observe)  # raises if a channel is unknown
         if self.fixed_std and self.discrete:
             raise TaskError(
@@ -63,12 +62,7 @@ class PolicyConfig:
                 "--no-discrete"
             )
         if self.network is None:
-            object.__setattr__(self, "network", config())
-        if not isinstance(self.network, config):
-            raise TaskError(
-                f"network {type(self.network).__name__} of agent {self.agent!r}: "
-                f"expected {config.__module__}.{config.__qualname__}"
-            )
+            object.__setattr__(self, "network", AGENTS[self.agent].config())
 
     @property
     def kind(self) -> ActionKind:

@@ -173,27 +173,10 @@ def layout_of(observation: Observation) -> Layout:
 
 def _declared_fields(observation: Observation) -> tuple[tuple[str, int, str], ...]:
     """Return the fields of an observation that only tasks of other packages have."""
-    names = sorted(observation.keys() - KNOWN)
-    if not names:
+    if not (names := observation.keys() - KNOWN):
         return ()
-    declared = {field.name: field for task in TASKS for field in TASKS[task].fields}
-    masks = {field.mask for field in declared.values()}
-    fields = []
-    for name in names:
-        if name not in declared and name not in masks:
-            raise TaskError(
-                f"observation entry {name!r}: networks cannot encode it; expected a field of a "
-                "registered task: declare an ObservationField in the task's `fields`"
-            )
-        if name in declared:
-            field, shape = declared[name], tuple(observation[name].shape)
-            if shape[1:] != (field.size,) or field.mask not in observation:
-                raise TaskError(
-                    f"observation field {name!r} has shape {shape}; expected (n, {field.size}), "
-                    f"and the entry {field.mask!r}"
-                )
-            fields.append((name, field.size, field.mask))
-    return tuple(fields)
+    fields = {field.name: field for task in TASKS for field in TASKS[task].fields}
+    return tuple((each, fields[each].size, fields[each].mask) for each in sorted(names & {*fields}))
 
 
 def require_layout(stored: Layout, observed: Layout, what: str) -> None:

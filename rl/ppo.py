@@ -236,10 +236,6 @@ class Learner:
         tasks: Collection[str] = (),
     ) -> None:
         """Build networks, optimiser and buffers, and begin episodes in the batch."""
-        if batch.action_kind != policy.kind:
-            raise TaskError(
-                f"the policy's actions are {policy.kind}, the batch's {batch.action_kind}"
-            )
         self.policy, self.config, self.device = policy, config, torch.device(device)
         self.update, self.num_updates = 0, config.num_updates(batch.num_envs)
         self.minibatch_size = config.minibatch_size(batch.num_envs)

@@ -167,10 +167,7 @@ def compile_tree(
     device: Device = "cpu",
 ) -> KinematicTree:
     """Compile robots for ``forward_kinematics``."""
-    most = max(len(robot.links) for robot in robots)
-    if max_links is not None and max_links < most:
-        raise ValueError(f"max_links is {max_links}; expected at least {most}")
-    links = max_links or most
+    links = max_links or max(len(robot.links) for robot in robots)
     size = len(robots), links
     parents, depth, place, column = np.zeros((4, *size), dtype=np.int64)
     movable = np.zeros(size, dtype=np.bool_)

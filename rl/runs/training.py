@@ -26,7 +26,7 @@ from morphgen.processes import one_torch_thread
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.config import PPOConfig, differences, policy_from
 from morphgen.rl.demonstrations.cloning import Cloner, DemonstrationBatches
-from morphgen.rl.observation_layout import Layout, last_link, layout_of, require_layout, with_fields
+from morphgen.rl.observation_layout import Layout, require_layout
 from morphgen.rl.ppo import FINETUNING_ACTOR_LR_SCALE, Learner, UpdateMetrics
 from morphgen.rl.runs.checkpoint import (
     CHECKPOINT,
@@ -119,23 +119,6 @@ def load_networks(learner: Learner, state: Mapping[str, Any]) -> None:
         getattr(learner, name).load_state_dict(state[name])
     if learner.config.desired_kl:
         learner.actor_lr_scale = FINETUNING_ACTOR_LR_SCALE
-
-
-def use_batch(learner: Learner, batch: TaskBatch) -> None:
-    """Continue with other environments; all of them begin new episodes."""
-    observation = batch.observe()
-    layout = layout_of(with_fields(observation, learner.layout.fields))
-    require_layout(learner.layout, layout, "the learner")
-    if (batch.num_envs, batch.action_kind) != (learner.batch.num_envs, learner.policy.kind):
-        raise TaskError(
-            f"{batch.num_envs} environments with {batch.action_kind} actions; expected "
-            f"{learner.batch.num_envs} with {learner.policy.kind} actions"
-        )
-    if (links := last_link(observation)) > learner.num_link_rows:
-        raise TaskError(
-            f"a robot has {links} links; the learner has room for {learner.num_link_rows}"
-        )
-    learner.use(batch)
 
 
 def _require_networks(learner: Learner, state: Mapping[str, Any]) -> None:
@@ -514,7 +497,7 @@ def _learn(
                 metrics = replace(metrics, scores=())
             record(metrics)
             if batches.changes_at(learner.update):
-                use_batch(learner, batches.make(learner.update))
+                learner.use(batches.make(learner.update))
             # A checkpoint has the state of the batch that the run continues with.
             left = learner.num_updates - learner.update
             is_stopped = stop.is_requested and left > 0

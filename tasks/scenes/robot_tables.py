@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from morphgen.encoding.tokens import MAX_LINKS, POSITION, pad_tokens, tokens
-from morphgen.errors import BenchmarkError, RobotError
+from morphgen.errors import RobotError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.model.kinematics import driving_joints, joint_limits
 from morphgen.model.kinematics_torch import FrameChain, compile_chain
@@ -99,8 +99,6 @@ def build_robot_tables(
     device: torch.device | str = "cpu",
 ) -> RobotTables:
     """Build the tables of robots."""
-    if not robots:
-        raise BenchmarkError("there are no robots")
     for robot in robots:
         robot.frame(TOOL)
         if robot.dof == 0:

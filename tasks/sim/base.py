@@ -126,7 +126,7 @@ class Simulation(ABC):
     On a GPU, ``reset`` and ``step`` read no tensor, so that the caller never waits for them.
 
     A new simulation is at rest at the home positions and at the poses of its scenes. Subclasses
-    implement ``_reset`` and ``_step``, which get valid arguments.
+    implement ``_reset`` and ``_step``.
     """
 
     q: torch.Tensor
@@ -140,8 +140,6 @@ class Simulation(ABC):
     """Linear velocities of the blocks in the world, (n, 3); zeros without one [m/s]."""
 
     def __init__(self, scenes: Sequence[Scene], device: torch.device) -> None:
-        if not scenes:
-            raise ValueError("there are no scenes; expected one or more")
         self.scenes, self.device = tuple(scenes), device
         self._num_obstacles = max(len(scene.obstacles) for scene in scenes)
         self._is_closed = False
@@ -166,22 +164,9 @@ class Simulation(ABC):
                 largest number of obstacles; None leaves them where they are.
 
         Raises:
-            ValueError: If a shape is wrong or, on the CPU, a number is not finite.
+            ValueError: On the CPU, if a number is not finite.
         """
         self._require_open()
-        n = len(self.scenes)
-        for name, values, shape in (
-            ("a mask", mask, (n,)),
-            ("q", q, tuple(self.q.shape)),
-            ("blocks", object_pose, (n, 7)),
-            ("obstacles", obstacle_poses, (n, self._num_obstacles, 7)),
-        ):
-            if values is not None and tuple(values.shape) != shape:
-                raise ValueError(
-                    f"reset with {name} of shape {tuple(values.shape)}; expected {shape}"
-                )
-        if str(mask.dtype) != "torch.bool":
-            raise ValueError(f"reset with a mask of type {mask.dtype}; expected torch.bool")
         self._reset(mask, q, object_pose, obstacle_poses)
 
     def step(self, targets: torch.Tensor) -> torch.Tensor:

@@ -237,11 +237,6 @@ def test_a_robot_of_weight_zero_does_not_change_the_loss():
             assert losses[0].equal(losses[1]) == same
 
 
-def test_a_batch_of_other_actions_is_rejected():
-    with pytest.raises(TaskError, match="actions are discrete, the batch's continuous"):
-        learner(OnALine(8, kind="continuous"))
-
-
 def test_metrics_that_are_not_finite_stop_the_run():
     batch = OnALine(8)
     trainer = learner(batch)

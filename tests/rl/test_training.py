@@ -15,7 +15,6 @@ import morphgen
 from helpers import runs
 from helpers.commands import tree
 from helpers.grammars import shipped
-from helpers.line_batch import OnALine, learner
 from helpers.runs import PPO, QUIET, after, small_config, small_source, untimed, weights
 from helpers.splits import member, split
 from morphgen.cli import main
@@ -420,20 +419,6 @@ def test_a_run_of_other_robots_is_not_resumed(tmp_path):
     for other in (drawn_config(updates=8, seed=1), drawn_config("cubes:5,stick:2", updates=8)):
         with pytest.raises(TaskError, match="has another run: source"):
             run(tmp_path / "run", other)
-
-
-def test_a_batch_that_does_not_fit_is_refused():
-    agent = learner()
-    with pytest.raises(TaskError, match="6 environments with discrete actions; expected 8"):
-        training.use_batch(agent, OnALine(6))
-    with pytest.raises(TaskError, match="8 environments with continuous actions; expected 8 with"):
-        training.use_batch(agent, OnALine(8, kind="continuous"))
-    agent = learner(agent="me-tf")
-    larger = OnALine(8)
-    observe = larger.observe
-    larger.observe = lambda: {**observe(), "links": observe()["links"] | True}
-    with pytest.raises(TaskError, match="a robot has 4 links; the learner has room for 3"):
-        training.use_batch(agent, larger)
 
 
 def test_goal_sets_are_reported_robot_by_robot():

@@ -159,8 +159,6 @@ def test_a_reset_changes_only_its_environments_and_forgets_their_past(arms, sim)
 def test_invalid_targets_are_reported_and_a_reset_repairs(sim):
     with pytest.raises(ValueError, match="targets have shape"):
         sim.step(torch.zeros(2, 2))
-    with pytest.raises(ValueError, match="no scenes"):
-        simulation([])
     home = sim.q.clone()
     targets = home.clone()
     targets[1, 0] = torch.nan
