@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from inspect import signature
 from itertools import takewhile
 from numbers import Integral
 from operator import eq
@@ -125,9 +126,9 @@ def _likeness(name: str, choice: str) -> float:
     ratio = difflib.SequenceMatcher(None, choice, name).ratio()
     num_unmatched = (1.0 - ratio) * (len(name) + len(choice))
     is_part = len(name) >= _MIN_PART and name in choice
-    # Short names that differ in a few letters, such as gltf and glb, have a low ratio.
-    is_near = ratio >= 0.6 or (ratio >= 0.5 and num_unmatched < 3.5)
     num_equal = len(list(takewhile(bool, map(eq, name, choice))))  # letters at the beginning
+    # Short names with few different letters have a low ratio: gltf and glb, but also stl and html.
+    is_near = ratio >= 0.6 or (ratio >= 0.5 and num_unmatched < 3.5 and num_equal > 0)
     return ratio + 1e-4 * num_equal if is_near or is_part else 0.0  # which decide between equals
 
 
@@ -202,12 +203,21 @@ def whole_number(
 
 
 def require_types(
-    given: SimpleNamespace, error: type[MorphgenError], *texts: str, **least: int
+    function: Callable[..., object],
+    given: SimpleNamespace,
+    error: type[MorphgenError],
+    *texts: str,
+    **least: int,
 ) -> None:
-    """Require texts by name, and others None or whole numbers of a least value, made ``int``."""
-    for name in (each for each in texts if getattr(given, each) is not None):
+    """Require arguments of a function to be texts, and others whole numbers, made ``int``.
+
+    Those whose default is None may be None.
+    """
+    defaults = {name: each.default for name, each in signature(function).parameters.items()}
+    not_given = {name for name in defaults if defaults[name] is getattr(given, name) is None}
+    for name in (each for each in texts if each not in not_given):
         text_argument(name, getattr(given, name), error)
-    for name in (each for each in least if getattr(given, each) is not None):
+    for name in (each for each in least if each not in not_given):
         setattr(given, name, whole_number(name, getattr(given, name), error, least[name]))
         if getattr(given, name) > MAX_WHOLE:
             raise error(f"{name}: expected at most 2^63 - 1")

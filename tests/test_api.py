@@ -237,14 +237,18 @@ make_env("reach", [], num_envs=2) => expected at least one robot
 make_env("reach", num_envs=2, config=3) => int is not the config of reach
 make_env("reach", num_envs=2, autoreset_mode="NextStep") => unknown option 'autoreset_mode'
 prims_env(num_envs=0) => 0 environments
+prims_env(num_envs=10**30) => at most 1,048,576 environments
+prims_env(num_envs=2, max_links=10**12) => expected 2 to 10000
 export("prims", "gltf") => unknown format 'gltf'; did you mean 'glb'
+export("prims", "stl") => unknown format 'stl'; valid: curobo, gif
 train("prims") => prims: no such file, and no split of this name
 train("prims task=reach", steps="9") => steps '9': expected a whole number, 1
 train("prims task=reach", sim="mujco") => did you mean 'mujoco'
-train("prims task=reach", agent=None, sim=3) => sim 3: expected a text
+train("prims task=reach", sim=3) => sim 3: expected a text
 train("prims task=reach", robot_seed=1) => only with drawn
 evaluate("ik", "prims task=reach", mode="best") => unknown mode 'best'; valid: deter
 evaluate("ik", "prims task=reach", episodes=0) => episodes 0: expected a whole num
+evaluate("ik", "prims task=reach", episodes=None) => episodes None: expected a whole num
 evaluate("zero-shot", goal_seed=1) => goal_seed and library: only with robots
 evaluate("zero-shot", method="mine") => method: only with submission
 evaluate("zero-shot", "prims task=reach", on="tests") => unknown side 'tests'

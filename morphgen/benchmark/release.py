@@ -290,7 +290,8 @@ def write_goals(home: Path, results: Sequence[GoalResult], config: GoalConfig) -
     with writing_split(home), locked_folder(home):
         sums = read_sums(home / SUMS_FILE)
         (home / SUMS_FILE).unlink()  # until all is written, the build is not finished
-        shutil.rmtree(home / GOALS, ignore_errors=True)
+        if has_goals(home):
+            shutil.rmtree(home / GOALS)
         others = {k: digest for k, digest in sums.items() if not k.startswith(f"{GOALS}/")}
         _add_files(home, files, others)
     return home / GOALS

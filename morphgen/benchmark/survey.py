@@ -34,7 +34,7 @@ from morphgen.grammar.values import RobotProperties
 from morphgen.model.findings import Finding
 from morphgen.model.robot import Robot
 from morphgen.processes import parallel_map
-from morphgen.progress import part_of
+from morphgen.progress import stage
 from morphgen.splits.split import SIDES, Member, Side, Split, sided_members
 from morphgen.tasks.registry import TASKS
 from morphgen.typing import Array
@@ -164,12 +164,9 @@ def different_members(split: Split) -> list[Member]:
 
 def survey_split(split: Split, library: Library, *, jobs: int = 1) -> SplitSurvey:
     """Compose, measure and compare the robots of a split; equal ones once."""
-    unique = different_members(split)
-    total = 2 * len(unique)
-    with part_of(total):
-        measure = partial(survey_robot, library, split.max_links)
-        robots = list(parallel_map(measure, unique, jobs))
-    with part_of(total, len(unique)):
+    measure = partial(survey_robot, library, split.max_links)
+    robots = list(parallel_map(measure, different_members(split), jobs))
+    with stage("comparing"):
         return compare_members(split, robots, jobs=jobs)
 
 

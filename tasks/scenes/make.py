@@ -41,6 +41,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+MAX_ENVS = 2**20
+"""Largest number of environments; the tokens of as many fill 4 GiB."""
+
 
 class BatchOptions(TypedDict, total=False):
     """Keyword arguments that every function of this module passes to ``batch_from_specs``."""
@@ -187,10 +190,10 @@ def batch_from_specs(
         whole_number(name, value, TaskError)
         for name, value in (("workers", workers), ("seed", seed))
     )
-    if num_envs < 1 or workers < 1 or not specs:
+    if not 1 <= num_envs <= MAX_ENVS or workers < 1 or not specs:
         raise TaskError(
-            f"{num_envs} environments of {len(specs)} robots with {workers} workers: at least "
-            "one of each"
+            f"{num_envs} environments of {len(specs)} robots with {workers} workers: expected at "
+            f"least one of each, and at most {MAX_ENVS:,} environments"
         )
     require_seed(seed)
     if kind not in (kinds := get_args(ActionKind)):

@@ -116,6 +116,8 @@ def _table_rows(
     robot: Robot, folders: Sequence[Path], max_links: int, num_joints: int
 ) -> dict[str, NDArray[Any]]:
     """Return one robot's row of each table."""
+    # First, as it requires few enough links for the memory.
+    link_tokens = tokens(robot, token_shapes(robot, folders), max_links=max_links)
     rows: dict[str, NDArray[Any]] = {
         name: np.zeros(num_joints) for name in ("lower", "upper", "max_step", "effort", "home")
     }
@@ -127,7 +129,6 @@ def _table_rows(
     rows |= {name: np.zeros(num_joints, dtype=bool) for name in ("moves_tool", "is_prismatic")}
     rows["ancestors"] = np.eye(max_links, dtype=bool)
 
-    link_tokens = tokens(robot, token_shapes(robot, folders), max_links=max_links)
     rows["tokens"], rows["link_mask"] = pad_tokens(link_tokens, max_links)
     rows["tokens"][:, POSITION.columns] = 0  # they change with every step; see ``LinkTokens``
     dof = robot.dof

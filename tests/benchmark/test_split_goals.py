@@ -8,6 +8,7 @@ import shutil
 from contextlib import closing
 from dataclasses import fields, replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -216,7 +217,7 @@ def test_stored_sets_are_read_back_unchanged(home, cache):
             assert type(was) is type(is_), each.name
 
 
-def test_builds_are_byte_identical(home, tmp_path):
+def test_builds_are_byte_identical_and_keep_no_earlier_goals(home, tmp_path, monkeypatch):
     other = built(tmp_path / "there", mixed())
     for i, folder in enumerate((home, other)):
         write_goals(folder, sample_sets(mixed(), tmp_path / f"cache{i}"), RECIPE)
@@ -225,6 +226,9 @@ def test_builds_are_byte_identical(home, tmp_path):
     assert tree(home) == tree(other)
     names = sorted(path.name for path in (home / "goals").iterdir())
     assert names == ["index.json", "test", "train"]
+    monkeypatch.setattr(shutil, "rmtree", Mock(side_effect=PermissionError(13, "denied", "goals")))
+    with pytest.raises(BenchmarkError, match="cannot write goals: denied"):
+        write_goals(home, sample_sets(mixed(), tmp_path / "cache0"), RECIPE)
 
 
 def test_batch_uses_stored_sets_and_rejects_others(home, cache, monkeypatch):

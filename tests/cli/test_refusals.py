@@ -62,6 +62,7 @@ export prims --format sfd => invalid choice: 'sfd'; did you mean 'sdf'?
 fit => name a part, a robot or a mesh file, or say --all
 fit plane --all => name a part, a robot or a mesh file, or say --all
 fit lost.stl => lost.stl: no such file
+fit flat.obj flat.obj => flat.obj: a mesh; expected a bundle, URDF, xacro or MJCF; `morph
 fit flat.obj => robot 'flat': link flat: no primitive can stand for its shapes
 fit bare.urdf => robot 'r': no link has a shape
 fit plane --iou 0.9 => --iou: only with --max-primitives

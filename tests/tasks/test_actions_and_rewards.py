@@ -365,6 +365,7 @@ def test_a_sound_task_is_stepped(make):
             {"begin": lambda *_: (torch.zeros(2, 1), torch.zeros(2, 7))},
             r"begin: the joint positions has shape \(2, 1\); expected \(2, 5\)",
         ),
+        (changed(terms=lambda terms: {}), "evaluate: expected at least one reward term"),
         (
             changed(terms=lambda terms: {"a": next(iter(terms.values())).mean()}),
             r"evaluate: the reward term 'a' has shape \(\); expected \(2,\)",

@@ -23,6 +23,7 @@ from morphgen.model import rotation
 from morphgen.model.findings import Finding
 from morphgen.model.geometry import (
     IDENTITY,
+    MESH_SUFFIXES,
     Box,
     Capsule,
     Cylinder,
@@ -94,10 +95,13 @@ def require_no_arguments(path: Path, args: Mapping[str, str] | None) -> None:
 
 
 def require_description_file(path: Path) -> None:
-    """Require that a path is a regular file whose name can be printed."""
+    """Require that a path is a regular file, no mesh, whose name can be printed."""
     if not path.is_file():
         why = "not a regular file" if path.exists() else "no such file"
         raise FormatError(f"{path}: {why}")
+    if path.suffix.lower() in MESH_SUFFIXES:
+        valid = "a bundle, URDF, xacro or MJCF; `morphgen fit` takes a mesh, one at a time"
+        raise FormatError(f"{path}: a mesh; expected {valid}")
     if str(path).encode(errors="replace").decode() != str(path):
         raise FormatError(f"{str(path)!a}: the file's name is not UTF-8 text")
 
