@@ -220,13 +220,6 @@ def part_rows(library: Library) -> list[Row]:
     return rows
 
 
-def neighbour_uris(uri: str, files: robot_uri.FileAccess) -> tuple[str, str]:
-    """Return the URIs of the previous and next robot in a robot's set or split, or empty texts."""
-    uris = ["", *(row.uri for row in sibling_rows(uri, files)), ""]
-    i = uris.index(uri.rstrip("/")) if uri.rstrip("/") in uris[1:-1] else 0
-    return (uris[i - 1], uris[i + 1]) if i else ("", "")
-
-
 def _set_rows(uri: str, folder: Path) -> Iterator[Row]:
     try:
         grammar = str(read_settings(folder)["grammar"])

@@ -502,8 +502,6 @@ def test_the_folder_of_all_uploads_has_no_address(opened):
 def test_splits_and_parts_are_listed(opened):
     rows = robot_rows.split_rows(SPLIT, robot_uri.resolve_split(SPLIT, opened))
     assert [row.role for row in rows] == ["train"] * 10 + ["test"] * 2
-    assert robot_rows.neighbour_uris(rows[1].uri, opened) == (rows[0].uri, rows[2].uri)
-    assert robot_rows.neighbour_uris(rows[0].uri, opened)[0] == ""
     parts = robot_rows.part_rows(opened.library)
     assert {row.role for row in parts} == {"arm", "ee", "body", "object"}
     assert "words:arm=ur5" in [row.uri for row in parts]

@@ -27,7 +27,6 @@ from morphgen.viewer import markup, robot_uri
 from morphgen.viewer.app.address import Address
 from morphgen.viewer.app.session import Session, bind, set_value
 from morphgen.viewer.robot_files import bundle_files, robot_page, turntable, zip_files
-from morphgen.viewer.robot_rows import neighbour_uris
 from morphgen.viewer.scene import robot as scene_robot
 from morphgen.viewer.scene import stage as scene_stage
 
@@ -39,27 +38,20 @@ ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": 180 / math.pi}  # number per r
 def show(session: Session) -> None:
     """Build the page of the robot that the address names."""
     uri = session.address.subject
-    session.open_panel(PANEL_WIDTH, _location(session, uri), f"reading {robot_uri.uri_name(uri)}")
+    session.open_panel(PANEL_WIDTH, _location(uri), f"reading {robot_uri.uri_name(uri)}")
     page = RobotPage(session, uri, split_colours(robot_uri.read_robot_uri(uri, session.files)))
     session.set_status("")
     session.run_in_background(page.check)
 
 
-def _location(session: Session, uri: str) -> str:
-    """Return breadcrumbs to the robot's set or split, with links to its neighbours there."""
+def _location(uri: str) -> str:
+    """Return breadcrumbs to the robot's set or split."""
     steps: list[tuple[str, Address | None]] = []
     if split := robot_uri.member_split(uri):
         steps.append((split, Address("split", (split,))))
     elif folder := robot_uri.parent_folder(uri):
         steps.append((folder, Address("gallery", (folder,))))
-    previous, following = neighbour_uris(uri, session.files)
-    links = [
-        markup.link(Address("robot", (neighbour,)), text)
-        for neighbour, text in ((previous, "◂ previous"), (following, "next ▸"))
-        if neighbour
-    ]
-    neighbours = markup.dim(" · ".join(links)) if links else ""
-    return markup.breadcrumbs(*steps, (robot_uri.uri_name(uri), None)) + markup.framed(neighbours)
+    return markup.breadcrumbs(*steps, (robot_uri.uri_name(uri), None))
 
 
 def _links(robot: Robot, uri: str) -> str:
