@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -45,7 +44,7 @@ def list_grammars(args: argparse.Namespace) -> None:
     opt.print_result(args, rows, lambda: table(cells, ("name", "robots")))
 
 
-SHORT_DERIVATION = 60  # number of characters of a derivation that `show` prints without `--full`
+SHORT_DERIVATION = 60  # number of characters of a derivation that `show` prints; `--json` has all
 
 
 def list_splits(args: argparse.Namespace) -> None:
@@ -91,34 +90,32 @@ def show_split(args: argparse.Namespace) -> None:
     except PartError as error:
         licences, lines = None, [f"licences: {error}; see --library"]
     data = {"id": split_id(split), **split.as_dict(), "licences": licences}
-    opt.print_result(args, data, lambda: _split_text(split, lines, full=args.full))
+    opt.print_result(args, data, lambda: _split_text(split, lines))
 
 
-def _split_text(split: Split, licences: Sequence[str], *, full: bool) -> str:
+def _split_text(split: Split, licences: Sequence[str]) -> str:
     from morphgen.splits.split import SIDES, split_id
 
     lines = [f"{split.name} ({split.regime}): {split.summary}", f"  id: {split_id(split)}"]
     if split.reference:
         lines.append(f"  reference: {split.reference}")
-    for key, value in split.provenance.items():
-        if full or isinstance(value, int | str):
-            text = value if isinstance(value, str) else json.dumps(value).replace('"', "")
-            lines.append(f"  {key}: {text}")
+    made = split.provenance.items()
+    lines += [f"  {key}: {value}" for key, value in made if isinstance(value, int | str)]
     lines += [f"  {line}" for line in licences]
     lines += [f"  accepted {code}: {reason}" for code, reason in split.accepted.items()]
     headers = ("name", "task", "category", "body", "derivation")
     for side in SIDES:
         members = split.side(side)
         counts = ", ".join(f"{n} {name}" for name, n in _categories(members).items())
-        rows = [_row(member, full=full) for member in members]
+        rows = [_row(member) for member in members]
         lines.append(f"\n{side}, {len(members)}: {counts}")
         lines.append(table(rows, headers))
     return "\n".join(lines)
 
 
-def _row(member: Member, *, full: bool) -> tuple[str, ...]:
+def _row(member: Member) -> tuple[str, ...]:
     text = member.derivation
-    if not full and len(text) > SHORT_DERIVATION:
+    if len(text) > SHORT_DERIVATION:
         text = f"{text[: SHORT_DERIVATION - 3]}..."
     return (member.name, _task(member), member.category, member.robot_hash[:8], text)
 
