@@ -51,27 +51,20 @@ EXAMPLES = "arm=kinova*, manufacturer=Kinova or arm=ur5+ee=plane"
 
 @dataclass(frozen=True)
 class _Condition:
-    """A property of one part of a robot: its name, or its manufacturer.
+    """A property of one part of a robot: ``arm=kinova*`` or ``manufacturer=Kinova``."""
 
-    ``arm=kinova*``, ``manufacturer=Kinova`` or ``arm.manufacturer=Kinova``. Patterns have shell
-    wildcards.
-    """
-
-    kind: str  # kind of the part; empty for any part
-    key: str  # `MANUFACTURER`, or empty for the name of the part
-    pattern: str  # name of the part, or of the manufacturer in any case
+    key: str  # kind of the part, or `MANUFACTURER`
+    pattern: str  # name of the part, or of the manufacturer in any case, with shell wildcards
 
     def __str__(self) -> str:
-        return f"{'.'.join(filter(None, (self.kind, self.key)))}={self.pattern}"
+        return f"{self.key}={self.pattern}"
 
     def matches(self, manifest: Manifest) -> bool:
         """Return whether it holds for a part."""
-        if self.kind not in ("", manifest.kind):
-            return False
         if self.key == MANUFACTURER:
             name = manifest.manufacturer.lower()
             return bool(name) and fnmatchcase(name, self.pattern.lower())
-        return fnmatchcase(manifest.name, self.pattern)
+        return self.key == manifest.kind and fnmatchcase(manifest.name, self.pattern)
 
     def matches_node(self, node: Derivation, library: Library) -> bool:
         """Return whether it holds for a part of a robot."""
@@ -138,26 +131,16 @@ def _condition(term: str, text: str, library: Library, origin: str) -> _Conditio
     key, _, value = term.partition("=")
     if not key or not value:
         raise BenchmarkError(f"{where}: expected KEY=VALUE, such as {EXAMPLES}")
-    owner, dot, name = key.rpartition(".")
-    if key in PART_KINDS:
-        _require_match(value, library.names(key), key, where)
-        return _Condition(key, "", value)
-    if name == MANUFACTURER and (not dot or owner in PART_KINDS):
-        condition = _Condition(owner if dot else "", MANUFACTURER, value)
-        manifests = [each for each in library.manifests() if owner in ("", each.kind)]
-        if not any(map(condition.matches, manifests)):
-            valid = {manifest.manufacturer for manifest in manifests} - {""}
-            raise BenchmarkError(f"{where}: no manufacturer {value!r}{nearest(value, valid)}")
-        return condition
-    keys = [*PART_KINDS, MANUFACTURER]
-    raise BenchmarkError(f"{where}: unknown key {key!r}{nearest(key, keys)}")
-
-
-def _require_match(pattern: str, names: Sequence[str], what: str, where: str) -> None:
-    if not any(fnmatchcase(name, pattern) for name in names):
-        raise BenchmarkError(
-            f"{where}: no {what} matches {pattern!r}{nearest(pattern.strip('*?'), names)}"
-        )
+    keys = (*PART_KINDS, MANUFACTURER)
+    if key not in keys:
+        raise BenchmarkError(f"{where}: unknown key {key!r}{nearest(key, keys)}")
+    condition, manifests = _Condition(key, value), library.manifests()
+    if not any(map(condition.matches, manifests)):
+        of_kind = (each for each in manifests if key in (MANUFACTURER, each.kind))
+        valid = {each.manufacturer if key == MANUFACTURER else each.name for each in of_kind}
+        hint = nearest(value.strip("*?"), valid - {""})
+        raise BenchmarkError(f"{where}: no {key} matches {value!r}{hint}")
+    return condition
 
 
 _Key: TypeAlias = tuple[int, ...]

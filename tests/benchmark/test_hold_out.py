@@ -156,9 +156,9 @@ def test_robots_with_too_many_links_are_left_out_and_counted():
 
 
 def test_the_file_has_hold_out_rules(tmp_path):
-    example = made(["ee=plane,arm.manufacturer=KUKA*"], 4, test=2)
+    example = made(["ee=plane,manufacturer=KUKA*"], 4, test=2)
     text = split_text(example)
-    assert "  hold_out: [ee=plane, arm.manufacturer=KUKA*]\n" in text
+    assert "  hold_out: [ee=plane, manufacturer=KUKA*]\n" in text
     stored = parse_split(text, tmp_path / "a.yaml")
     assert stored.id == split_id(stored.split)
     assert stored.split == replace(example, provenance=stored.split.provenance)
@@ -232,7 +232,6 @@ def robot(words):
         ("base=fixed", "arm=lwr", True),
         ("manufacturer=kinova", "arm=mico ee=plane", True),
         ("manufacturer=Kin*", "arm=lwr ee=jaco_fingers", True),
-        ("arm.manufacturer=Kinova", "arm=lwr ee=jaco_fingers", False),
         ("manufacturer=*", "arm=arm3 ee=plane", False),
         ("arm=lwr+ee=plane", "arm=lwr ee=plane", True),
     ],
@@ -247,10 +246,10 @@ def test_a_rule_holds_for_robots_with_what_it_names(rule, words, holds):
 
 
 def test_the_text_of_a_rule_gives_the_same_rule():
-    texts = "arm=kinova*,manufacturer=Kinova,arm.manufacturer=ABB"
+    texts = "arm=kinova*,manufacturer=ABB"
     rules = parse_rules([f"{texts},arm=ur5+ee=plane"], LIBRARY)
     assert parse_rules([str(rule) for rule in rules], LIBRARY) == rules
-    assert [str(rule) for rule in rules][2:] == ["arm.manufacturer=ABB", "arm=ur5+ee=plane"]
+    assert [str(rule) for rule in rules][1:] == ["manufacturer=ABB", "arm=ur5+ee=plane"]
 
 
 @pytest.mark.parametrize(
@@ -262,7 +261,7 @@ def test_the_text_of_a_rule_gives_the_same_rule():
         ("arm", "--hold-out arm: expected KEY=VALUE, such as arm=kinova*, manufacturer=Kinova"),
         ("arm=ur5,", "--hold-out arm=ur5,: empty rule: expected KEY=VALUE"),
         ("arm=ur5,arm=ur5", "arm=ur5 is there twice"),
-        ("manufacturer=Kinvoa", "no manufacturer 'Kinvoa'; did you mean 'Kinova'? valid: ABB"),
+        ("manufacturer=Kinvoa", "no manufacturer matches 'Kinvoa'; did you mean 'Kinova'?"),
     ],
 )
 def test_an_invalid_rule_is_an_error_that_names_it(text, message):
