@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Mapping
-from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -101,20 +100,13 @@ def write_export(
     path = _target(source, robot, given)
     if source is not None and path in taken:
         raise FormatError(f"{source.label}: {path} is of another robot of this command already")
-    made = [folder for folder in path.parents if not folder.exists()]
-    try:
-        if given.format in FILES:
-            content = FILES[given.format](robot, given)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomic(path, content)
-        else:
-            with writing_export(path, given.format, robot.name) as folder:
-                FOLDERS[given.format](robot, folder, given)
-    except BaseException:
-        for folder in made:  # the inner ones come first
-            with suppress(OSError):
-                folder.rmdir()
-        raise
+    if given.format in FILES:
+        content = FILES[given.format](robot, given)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, content)
+    else:
+        with writing_export(path, given.format, robot.name) as folder:
+            FOLDERS[given.format](robot, folder, given)
     return path
 
 
