@@ -207,6 +207,7 @@ held_out(robots=[3]) => split: robots [3]: expected a
 held_out(task=None) => split: task None: expected a text
 sample(".", 1) => unknown grammar '.'
 similarity(["prims", "prims"], []) => no measure is named; valid: cos
+similarity(["prims", "prims"], "cosin") => 'cosin'; did you mean 'cosine'? valid: cos
 tokens("arm3-stick", max_links=23.5) => max_links 23.5: expected a whole
 held_out(seed=True) => split: seed True: expected a whole number
 held_out(obstacles="no") => split: obstacles 'no': expected True or False

@@ -185,8 +185,6 @@ def hull_distance(point: ArrayLike, points: ArrayLike) -> float:
     equal = np.block([[scaled.T, np.eye(d), -np.eye(d)], [np.ones((1, n)), np.zeros((1, 2 * d))]])
     cost = np.concatenate([np.zeros(n), np.ones(2 * d)])
     solution = scipy.optimize.linprog(cost, A_eq=equal, b_eq=np.append(target, 1.0), method="highs")
-    if not solution.success:
-        raise BenchmarkError(f"the convex hull of {n} robots: {solution.message}")
     return max(float(solution.fun), 0.0)
 
 

@@ -509,10 +509,6 @@ def classical_mds(distances: ArrayLike) -> MdsMap:
     The sign of each axis is such that the farthest point is positive.
     """
     d = np.asarray(distances, dtype=np.float64)
-    if d.ndim != 2 or d.shape[0] != d.shape[1] or not len(d):
-        raise ValueError(f"distances have shape {d.shape}; expected (n, n)")
-    if not np.isfinite(d).all() or (d < 0).any() or d.diagonal().any() or (d != d.T).any():
-        raise ValueError("distances must be finite, symmetric, not negative, and 0 to oneself")
     squared = d * d
     rows = squared.mean(axis=0)
     values, vectors = np.linalg.eigh(-(squared - rows - rows[:, None] + rows.mean()) / 2)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from morphgen.errors import BenchmarkError, nearest, whole_number
+from morphgen.errors import BenchmarkError, whole_number
 from morphgen.formats.rounding import as_written
 from morphgen.model import rotation
 from morphgen.model.geometry import IDENTITY, Box, Capsule, Cylinder, Geometry, Pose, Shape, Sphere
@@ -185,12 +185,6 @@ def tokens(
     robots.
     """
     require_max_links(len(robot.links), f"robot {robot.name!r}", max_links)
-    for name in shapes:
-        if name not in robot.link_index:
-            raise BenchmarkError(
-                f"robot {robot.name!r}: a shape is for the unknown link {name!r}"
-                + nearest(name, robot.link_index)
-            )
     robot = as_written(robot)  # rounded as in its file: composed and read back, the same tokens
     codes = encode_joint_positions(robot, robot.home if q is None else q)
     tool = robot.tool and robot.tool.link

@@ -191,8 +191,6 @@ def signed_distance(primitives: Sequence[Shape], points: Array) -> Array:
     They are negative inside, and exact outside and inside of one primitive; inside of several
     overlapping primitives the surface may be farther away.
     """
-    if not primitives:
-        raise ValueError("there are no primitives")
     return np.asarray(np.min([_distance(shape, points) for shape in primitives], axis=0))
 
 

@@ -204,8 +204,6 @@ def _ragged(counts: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp
 
 def solid_of(shapes: Sequence[Shape]) -> Solid:
     """Return the solid of at least one shape, fixed to each other."""
-    if not shapes:
-        raise FitError("there are no shapes")
     meshes = map(link_frame_mesh, shapes)
     solids = [solid for mesh in meshes if (solid := solid_of_mesh(mesh)) is not None]
     if not solids:

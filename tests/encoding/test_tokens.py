@@ -129,7 +129,6 @@ def test_tokens_are_batched_over_q():
     [
         (arm(), {}, {"max_links": 5}, "robot 'arm' has 6 links, more than max_links 5"),
         (hinge(), {}, {"max_links": 1}, "max_links 1: expected 2 to 10000"),
-        (arm(), {"uper": Shape(Sphere(1.0))}, {}, "unknown link 'uper'; did you mean 'upper'?"),
         (hinge(), {"b": Shape(Mesh(Path("x.stl")))}, {}, "link 'b': a mesh has no token"),
         (hinge(), {"b": Shape(Sphere(0.0))}, {}, "link 'b': sizes [0, 0, 0] are not all positive"),
         (

@@ -365,9 +365,9 @@ def test_measures_are_reproducible_and_sampling_errors_are_small():
     assert quality(cube, ball).iou == pytest.approx(math.pi / 6, abs=2e-3)
 
 
-def test_meshes_empty_lists_and_flat_boxes_are_errors(tmp_path):
+def test_meshes_and_flat_boxes_are_errors(tmp_path):
     cube = solid_of([UNIT_CUBE])
-    for wrong in ([], [UNIT_CUBE, Shape(Mesh(tmp_path / "a.stl"))], [Shape(Box((1, 0, 1)))]):
+    for wrong in ([UNIT_CUBE, Shape(Mesh(tmp_path / "a.stl"))], [Shape(Box((1, 0, 1)))]):
         with pytest.raises(ValueError, match="primitive"):
             quality(cube, wrong)
         with pytest.raises(ValueError, match="primitive"):

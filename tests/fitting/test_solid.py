@@ -201,9 +201,7 @@ def test_flat_meshes_are_errors(tmp_path, pose):
     assert counted(solid_of([shape, Shape(Box(SIZE))])) == pytest.approx(BOX_VOLUME, rel=1e-9)
 
 
-def test_missing_shapes_and_unreadable_meshes_are_errors(tmp_path):
-    with pytest.raises(FitError, match="no shapes"):
-        solid_of([])
+def test_an_unreadable_mesh_is_an_error(tmp_path):
     with pytest.raises(MeshError, match=r"lost\.stl"):
         solid_of([Shape(Box(SIZE)), Shape(Mesh(tmp_path / "lost.stl"))])
 
