@@ -15,7 +15,7 @@ from morphgen.errors import TaskError, nearest
 from morphgen.formats.records import read_record
 from morphgen.model.robot import Robot
 from morphgen.processes import one_torch_thread
-from morphgen.progress import report
+from morphgen.progress import note, report
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.baselines import BASELINES, Controller
 from morphgen.rl.config import policy_from
@@ -28,8 +28,13 @@ from morphgen.rl.observation_layout import (
     with_fields,
 )
 from morphgen.rl.policies import make_networks, rows_needed
-from morphgen.rl.runs.checkpoint import Interface, policy_interface, read_checkpoint
-from morphgen.rl.shipped_policies import checkpoint_path, policies_for, tasks_of
+from morphgen.rl.runs.checkpoint import (
+    Interface,
+    RunConfig,
+    policy_interface,
+    read_checkpoint,
+)
+from morphgen.rl.shipped_policies import checkpoint_path, name_of, policies_for, tasks_of
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.observation import Observation
 from morphgen.tasks.registry import TASKS, require_device
@@ -187,6 +192,12 @@ class ControllerSpec:
     """State of the learner in the checkpoint; None for a baseline."""
 
 
+def note_unfinished(file: Path, run: RunConfig, learner: dict[str, Any]) -> None:
+    """Show that a checkpoint is not the last one of its run; shipped policies are as they are."""
+    if learner["update"] < run.num_updates and name_of(file) == str(file):
+        note(f"morphgen: {file} is not finished: update {learner['update']} of {run.num_updates}")
+
+
 def read_controller(name: str, task: str) -> ControllerSpec:
     """Return the controller of a name; ``make_env_and_controller`` makes it."""
     valid = policies_for(task)
@@ -201,6 +212,7 @@ def read_controller(name: str, task: str) -> ControllerSpec:
     if not path.exists():
         raise TaskError(f"{name!r} is neither a checkpoint nor a policy{nearest(name, valid)}")
     run, learner = read_checkpoint(path)
+    note_unfinished(path, run, learner)
     config = GoalConfig(tasks=run.evaluation_tasks).task_config(task)
     return ControllerSpec(name, task, config, run.interface, learner)
 

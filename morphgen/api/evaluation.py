@@ -44,6 +44,7 @@ from morphgen.rl.inference import (
     Episode,
     Mode,
     make_env_and_controller,
+    note_unfinished,
     read_controller,
 )
 from morphgen.rl.inference import play as run_episodes
@@ -290,10 +291,7 @@ def _policy_scores(given: SimpleNamespace) -> dict[str, list[Score]]:
     files = list(checkpoint_files(path))
     for file in files:
         run, learner = read_checkpoint(file)
-        if learner["update"] < run.num_updates and not is_named(name):
-            note(
-                f"morphgen: {file} is not finished: update {learner['update']} of {run.num_updates}"
-            )
+        note_unfinished(file, run, learner)
     if len(files) > 1:  # a policy for each robot: their seeds and budgets are parts of the run's
         run = read_config(path)
     config = eval_config_of(run, given.episodes, seed=given.seed, workers=given.workers)

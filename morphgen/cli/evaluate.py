@@ -17,7 +17,7 @@ from morphgen.cli.train import RESUME, print_run
 from morphgen.rl.demonstrations.reader import Demonstrations
 from morphgen.rl.demonstrations.recording import TOLERANCE
 from morphgen.rl.evaluation import eval_config_of, zero_shot, zero_shot_data
-from morphgen.rl.inference import Episode
+from morphgen.rl.inference import Episode, note_unfinished
 from morphgen.rl.runs.checkpoint import read_checkpoint
 from morphgen.rl.runs.robot_source import robot_source
 from morphgen.rl.scores import Score, require_table, success_of
@@ -79,7 +79,8 @@ def zeroshot(args: argparse.Namespace) -> None:
         source = robot_source(
             " ".join(args.words), args.task, obstacles=args.obstacles, library=tuple(args.library)
         )
-        run, _ = read_checkpoint(policy)
+        run, learner = read_checkpoint(policy)
+        note_unfinished(policy, run, learner)
     config = eval_config_of(run, args.episodes, seed=args.seed, workers=args.workers)
     tasks = with_goal(config.tasks, args.goal, [args.task])
     config = replace(config, sim=args.sim or DEFAULT_SIMULATOR, tasks=tasks)

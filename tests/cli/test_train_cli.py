@@ -70,6 +70,8 @@ def test_resume_continues_to_the_steps_of_the_run(run, monkeypatch):
             run(*command, "--steps", "96", "--envs", "4", "--sim", sim)
         folder = Path(command[-1])
         assert [each["update"] for each in read_metrics(folder)] == [1]
+        _, _, err = run("play", "reach", "planar-cube", "--policy", folder, "--sim", sim)
+        assert err == f"morphgen: {folder} is not finished: update 1 of 3\n"
         assert run(*command, "--resume")[0] == 0
         assert [each["update"] for each in read_metrics(folder)] == [1, 2, 3]
         assert "num_envs 4, not 8" in run(*command, "--resume", "--envs", "8")[2]
