@@ -276,11 +276,11 @@ def _last_parts(
         new = last.get(item.name, {(item.name, frozenset())})
         low, high = item.repetition or (1, 1)
         before, trunks = trunks, set()
-        for n in range(1, min(high, 2) + 1):  # further copies are attached as the second one
+        for n in range(1, min(high, 3) + 1):  # further copies are attached as the third one
             after = set() if i or n > 1 else set(new)
             for part, taken in before:
                 port = free_port(part, library.manifest(part).ports, taken, item)
                 after |= {(part, taken | {port})} if item.port else new
-            trunks |= after if n >= min(low, 2) else set()
+            trunks |= after if n >= min(low, 3) else set()
             before = after
     return trunks

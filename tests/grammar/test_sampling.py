@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pandas
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
 from helpers.commands import start, tree
@@ -154,6 +154,7 @@ def test_random_small_grammars_yield_valid_robots_or_an_error(monkeypatch, text)
 # Few random grammars are sound, and how few is chance: that is no fault of the test.
 @settings(max_examples=60, suppress_health_check=[HealthCheck.filter_too_much])
 @given(TEXTS, st.integers(0, 3))
+@example("robot -> left:fixed{3}", 0)  # the third copy finds the port taken
 def test_grammars_without_faults_can_be_derived(text, seed):
     grammar = grammar_from_text(text, "g")
     assume(count_structures(grammar) <= 100)
