@@ -16,7 +16,6 @@ from helpers.splits import member, split
 from morphgen.encoding.robot_hash import robot_hash
 from morphgen.encoding.tokens import tokens
 from morphgen.errors import (
-    BenchmarkError,
     CompositionError,
     FormatError,
     PartError,
@@ -219,8 +218,6 @@ def test_robots_without_a_tool_or_moving_joint_are_rejected():
         build_robot_tables([bare])
     with pytest.raises(RobotError, match="no joint moves"):
         build_robot_tables([replace(bare, frames=(Frame("tool", "a"),))])
-    with pytest.raises(BenchmarkError, match="no robots"):
-        build_robot_tables([])
 
 
 POSITION = ReachConfig(num_goals=5, max_episode_steps=6)
