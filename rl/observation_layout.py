@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -156,6 +156,8 @@ class Layout(Record, frozen=True):
 
 def layout_of(observation: Observation) -> Layout:
     """Return the layout of an observation."""
+    others = observation.keys() - KNOWN  # fields that only tasks of other packages have
+    declared = fields_of(TASKS) if others else ()
     return Layout(
         links=observation["tokens"].shape[1],
         token=observation["tokens"].shape[2],
@@ -163,20 +165,12 @@ def layout_of(observation: Observation) -> Layout:
         points=observation["points"].shape[1] if "points" in observation else 0,
         channels=tuple(name for name in CHANNELS if name in observation),
         tool="tool" in observation,
-        fields=_declared_fields(observation),
+        fields=tuple(sorted(field for field in declared if field[0] in others)),
         vectors=tuple(
             (name, observation[name].shape[2]) for name in KINEMATIC_CHANNELS if name in observation
         ),
         tree=TREE[0] in observation,
     )
-
-
-def _declared_fields(observation: Observation) -> tuple[tuple[str, int, str], ...]:
-    """Return the fields of an observation that only tasks of other packages have."""
-    if not (names := observation.keys() - KNOWN):
-        return ()
-    fields = {field.name: field for task in TASKS for field in TASKS[task].fields}
-    return tuple((each, fields[each].size, fields[each].mask) for each in sorted(names & {*fields}))
 
 
 def require_layout(stored: Layout, observed: Layout, what: str) -> None:
@@ -192,7 +186,7 @@ Fields = Sequence[tuple[str, int, str]]
 """Name, size and mask of fields of tasks, as in ``Layout.fields``."""
 
 
-def fields_of(tasks: Collection[str]) -> Fields:
+def fields_of(tasks: Iterable[str]) -> Fields:
     """Return the fields that tasks declare."""
     declared = dict.fromkeys(field for task in sorted(tasks) for field in TASKS[task].fields)
     return tuple((field.name, field.size, field.mask) for field in declared)
@@ -206,11 +200,6 @@ def with_fields(observation: Observation, fields: Fields) -> Observation:
             added[name] = torch.zeros(len(links), size, device=links.device)
             added.setdefault(mask, torch.zeros_like(links[:, 0]))
     return added
-
-
-def last_link(observation: Observation) -> int:
-    """Return how many rows of links there are up to the last one that some robot uses."""
-    return int(torch.nonzero(observation["links"].any(dim=0)).max()) + 1
 
 
 def truncate_links(observation: Observation, rows: int) -> Observation:

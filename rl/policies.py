@@ -18,7 +18,6 @@ from morphgen.rl.observation_layout import (
     MaskedGaussian,
     MaskedMultiDiscrete,
     bounded_log_std,
-    last_link,
 )
 from morphgen.tasks.actions import BINS
 from morphgen.tasks.kinematic_channels import IK_SHARE
@@ -163,7 +162,7 @@ def rows_needed(config: PolicyConfig, observation: Observation) -> int:
     """
     if AGENTS[config.agent].network.needs_all_entries:
         return observation["links"].shape[1]
-    return last_link(observation)
+    return int(torch.nonzero(observation["links"].any(dim=0)).max()) + 1
 
 
 def entries_unneeded(config: PolicyConfig, tasks: Collection[str]) -> frozenset[str]:

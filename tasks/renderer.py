@@ -316,8 +316,6 @@ class Renderer:
 
     def _place(self, state: RenderState) -> None:
         """Put everything where it is in a state."""
-        if self._closed:
-            raise ValueError("this renderer is closed")
         model, data = self._model, self._data
         data.qpos[self._q_at] = movable_positions(self._robot, state.q)
         poses = dict(state.markers)

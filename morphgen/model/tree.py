@@ -12,11 +12,7 @@ from morphgen.model.rotation import Vec3, rotate
 
 
 def subtree(robot: Robot, root: str, without: Collection[str] = ()) -> Robot:
-    """Cut out the part of a robot below a link.
-
-    Returns:
-        ``root`` and the links below it, with the joints, home, frames and ignore pairs among them.
-    """
+    """Return a link and all below it, with the joints, home, frames and ignore pairs among them."""
     for name in (root, *without):
         robot.link(name)
     kept = {root}

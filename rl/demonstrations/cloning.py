@@ -43,11 +43,7 @@ MAX_GIB = 24
 
 
 def recorded_source(data: Sequence[Demonstrations]) -> RecordedSource:
-    """Return the robots and tasks of data sets as the source of a run.
-
-    Raises:
-        TaskError: If one data set has robots among obstacles and another has not.
-    """
+    """Return the robots and tasks of data sets as the source of a run."""
     folders = [str(each.folder.resolve()) for each in data]
     obstacles = {bool(spec.scene.obstacles) for each in data for spec in each.specs.values()}
     if len(obstacles) > 1:
@@ -90,11 +86,7 @@ class DemonstrationBatches:
     drawn = None
 
     def __init__(self, config: RunConfig) -> None:
-        """Read the data sets.
-
-        Raises:
-            TaskError: If one has changed since the run began.
-        """
+        """Read the data sets, which must be those that the run began with."""
         source = config.source
         assert isinstance(source, RecordedSource)
         self._config = config
@@ -226,11 +218,7 @@ class Cloner(Learner):
 
 
 def data_sets(folders: Sequence[str | Path]) -> list[Demonstrations]:
-    """Read data sets whose steps are learned together.
-
-    Raises:
-        TaskError: If their tasks have other constants.
-    """
+    """Read data sets whose steps are learned together: their tasks must have the same constants."""
     data = [Demonstrations(folder) for folder in folders]
     for each in data[1:]:
         for task, constants in each.settings["constants"].items():

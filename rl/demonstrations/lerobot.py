@@ -85,11 +85,7 @@ def assemble(
 ) -> None:
     """Write the files of the format from at least one episode; ``meta/info.json`` last.
 
-    Args:
-        folder: The data set, with the robots.
-        shards: Shard of each robot by its hash, in order.
-        tasks: Names of the tasks.
-        videos: Features of the cameras.
+    Shards are by the hash of their robot, in order; ``videos`` are the features of the cameras.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -144,11 +144,7 @@ Unit = dict[str, tuple[Source, Member | OneRobot]]
 
 
 def robots_of(config: RecordingConfig, jobs: int = 1) -> dict[str, Unit]:
-    """Return the robots of all sources by their hashes, in order.
-
-    Raises:
-        TaskError: If a robot has a task both among obstacles and without.
-    """
+    """Return the robots of all sources by their hashes, in order."""
     units: dict[str, Unit] = {}
     for source in config.sources:
         described: Sequence[Member | OneRobot]
@@ -242,15 +238,7 @@ def record_states(
 
     Ross, Gordon and Bagnell 2011, "A reduction of imitation learning and structured prediction to
     no-regret online learning". A round is a data set of its own, with the goals of the other one.
-
-    Args:
-        data: Data set with the robots, their tasks and goals.
-        folder: The data set to record.
-        policy: Folder of the policy's run, or another policy.
-        planner: Baseline whose actions are the labels.
-        episodes: Number of episodes of each robot at each task.
-        seed: Seed of the episodes.
-        jobs: Number of processes.
+    ``episodes`` are those of each robot at each task.
     """
     sources = tuple(
         robot_source(

@@ -95,11 +95,7 @@ class ArticulatedStartSet(GoalSet):
 
     @cached_property
     def thing(self) -> ArticulatedObject:
-        """The object where it stands.
-
-        Raises:
-            SimulationError: If the text is not of such an object; it has no meshes.
-        """
+        """The object where it stands; a SimulationError if the text is not of one."""
         x, y, z, qw, qx, qy, qz = self.place.tolist()
         pose = Pose((x, y, z), (qw, qx, qy, qz))
         return ArticulatedObject(read_body(self.urdf), pose, self.friction)

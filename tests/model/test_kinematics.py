@@ -157,13 +157,6 @@ def test_a_batch_agrees_with_its_robots(dtype, atol):
             np.testing.assert_allclose(result, expected, atol=atol)
 
 
-def test_a_tree_can_be_padded_to_more_links():
-    tree = batched.compile_tree([arm()], max_links=9)
-    T = batched.forward_kinematics(tree, torch.tensor([0]), torch.tensor([arm().home]))
-    assert T.shape == (1, 9, 4, 4)
-    assert (T[:, 6:] == torch.eye(4)).all()
-
-
 def test_a_robot_with_one_link():
     tree = batched.compile_tree([Robot("stone", (Link("a"),))])
     T = batched.forward_kinematics(tree, torch.tensor([0, 0]), torch.zeros(2, 0))

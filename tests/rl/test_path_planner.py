@@ -19,7 +19,7 @@ from morphgen.model.robot import Joint, Link
 from morphgen.rl.baselines import baselines_for, path_planner
 from morphgen.rl.baselines import scripted_push as pushing
 from morphgen.rl.baselines.path_planner import PathCost, PathFollower, PathPlanner
-from morphgen.rl.baselines.reach import GAIN, InverseKinematics, JacobianColumns, column_steps
+from morphgen.rl.baselines.reach import GAIN, InverseKinematics, JacobianColumns
 from morphgen.rl.baselines.scripted_articulated import Scripted
 from morphgen.rl.baselines.scripted_push import Push, PushPlanner, ScriptedPush, ToolKinematics
 from morphgen.rl.inference import run_episodes
@@ -245,14 +245,6 @@ def test_a_reach_episode_scores_the_mean_of_its_steps(made):
     assert episode.steps == len(found) == REACH.max_episode_steps
     assert episode.score == pytest.approx(np.mean(found), rel=1e-4)
     assert episode.score != pytest.approx(found[-1], rel=1e-4)
-
-
-def test_a_step_is_the_projection_on_the_column():
-    J = torch.tensor([[[0.5, 0.0, 2.0, 1e-6], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0]]])
-    error = torch.tensor([[0.1, -0.2, 0.3]])
-    steps = column_steps(J, error)
-    expected = torch.tensor([[0.05 / 0.25, -0.2, (0.2 + 0.6) / 8, 0.0]])
-    assert torch.allclose(steps, expected)
 
 
 def test_a_slide_moves_by_a_share_of_the_error_along_its_axis(made):

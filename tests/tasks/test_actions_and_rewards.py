@@ -23,7 +23,6 @@ from morphgen.errors import (
     TaskError,
 )
 from morphgen.fitting.token_shapes import token_shapes
-from morphgen.formats.fits import has_meshes
 from morphgen.formats.urdf.write import urdf_text
 from morphgen.grammar.library import default_library
 from morphgen.model.kinematics import random_configurations
@@ -44,7 +43,7 @@ from morphgen.tasks.scenes.env_specs import load_robot
 from morphgen.tasks.scenes.make import make_batch, make_split_batch
 from morphgen.tasks.scenes.robot_tables import STEP_SLIDE, STEP_TURN, build_robot_tables
 from morphgen.tasks.sim.base import CONTROL_PERIOD
-from morphgen.tasks.task import GOAL, ObservationField, Task, TaskEnvs, TaskState
+from morphgen.tasks.task import GOAL, ObservationField, Task, TaskState
 
 CPU = torch.device("cpu")
 
@@ -319,7 +318,6 @@ def make(monkeypatch, tmp_path):
 
     def step(
         fields=(GOAL, EXTRA),
-        made=None,
         make_envs=True,
         sample=Reach.sample,
         begin=ReachEnvs.begin,
@@ -331,7 +329,7 @@ def make(monkeypatch, tmp_path):
             return made
 
         parts = {"name": "hover", "config_type": HoverConfig, "fields": fields, "sample": sample}
-        parts["make_envs"] = lambda self, *args: made or (envs(*args) if make_envs else None)
+        parts["make_envs"] = lambda self, *args: envs(*args) if make_envs else None
         TASKS.register(type("Hover", (Reach,), parts)())
         batch = make_batch("hover", ["gantry-plane"], 2, sim="kinematic", cache=tmp_path)
         batch.reset()
@@ -367,10 +365,6 @@ def test_a_sound_task_is_stepped(make):
             changed(terms=lambda terms: {"a": next(iter(terms.values())).mean()}),
             r"evaluate: the reward term 'a' has shape \(\); expected \(2,\)",
         ),
-        (
-            changed(terms=lambda terms: {"a": next(iter(terms.values()))[:, None]}),
-            r"evaluate: the reward term 'a' has shape \(2, 1\); expected \(2,\)",
-        ),
         ({"observe": ReachFormulas.observe}, "observe returned goal; expected .*: goal, extra"),
         ({"fields": (GOAL,)}, "observe returned goal, extra; expected the task's `fields`: goal"),
         (
@@ -404,13 +398,6 @@ def test_an_incomplete_task_is_not_registered(monkeypatch, parts, message):
     with pytest.raises(TaskError, match=f"task {message}"):
         TASKS.register(type("Hover", (Task,), parts)())
     assert parts["name"] not in TASKS
-
-
-@pytest.mark.parametrize("parts", [{}, {"formulas": None}])
-def test_environments_need_formulas(make, parts):
-    bare = type("Bare", (TaskEnvs,), {"begin": ReachEnvs.begin, **parts})
-    with pytest.raises(TaskError, match="task 'hover': Bare has no `formulas`; expected StepForm"):
-        make(made=bare())
 
 
 def test_a_run_of_an_unknown_task_is_named():
@@ -505,10 +492,6 @@ def rewards_of(batch):
 def test_names_are_compose_arguments(given, words):
     found, expected = load_robot(given), morphgen.compose(words, geometry="primitive")
     assert (found.name, robot_hash(found)) == (expected.name, robot_hash(expected))
-
-
-def test_collision_shapes_are_primitives():
-    assert not any(has_meshes(link.collisions) for link in load_robot("ur5-plane").links)
 
 
 def test_robot_files_are_read(tmp_path, monkeypatch):

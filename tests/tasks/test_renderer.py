@@ -148,14 +148,6 @@ def test_articulated_object_is_drawn_where_its_joint_is(plain):
     assert changed(shut, ajar).sum() > 50
 
 
-def test_closed_renderer_raises_a_clear_error(on, reach):
-    drawing = on(reach)
-    drawing.close()
-    drawing.close()
-    with pytest.raises(ValueError, match="closed"):
-        drawing.frame(RenderState(reach.goals.q[0]))
-
-
 def test_snapshot_is_one_environment_of_a_batch(reach, push):
     batch = batch_from_specs([reach, push], 2, sim="mujoco")
     batch.reset()

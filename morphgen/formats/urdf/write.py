@@ -151,6 +151,8 @@ def _write_geometry(element: etree._Element, geometry: Geometry, mesh_uri: MeshU
             etree.SubElement(element, "cylinder", _texts({"radius": radius, "length": length}))
         case Mesh():
             etree.SubElement(element, "mesh", filename=mesh_uri(geometry))
+        case Capsule():
+            raise FormatError("URDF has no capsule; write the pieces of urdf_pieces")
 
 
 def _write_joint(root: etree._Element, joint: Joint) -> None:
