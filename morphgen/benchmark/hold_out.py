@@ -132,6 +132,11 @@ def _condition(term: str, text: str, library: Library, origin: str) -> _Conditio
     if not key or not value:
         raise BenchmarkError(f"{where}: expected KEY=VALUE, such as {EXAMPLES}")
     keys = (*PART_KINDS, MANUFACTURER)
+    if "." in key:
+        raise BenchmarkError(
+            f"{where}: a range of a parameter is a rule of morphgen 0.3 alone; audit the split "
+            "with 0.3, or hold sizes out by `split new interpolation --hull outside`"
+        )
     if key not in keys:
         raise BenchmarkError(f"{where}: unknown key {key!r}{nearest(key, keys)}")
     condition, manifests = _Condition(key, value), library.manifests()
