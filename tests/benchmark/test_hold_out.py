@@ -257,10 +257,7 @@ def test_the_text_of_a_rule_gives_the_same_rule():
     [
         ("arm=kinva*", "--hold-out arm=kinva*: no arm matches 'kinva*'; did you mean"),
         ("amr=ur5", "unknown key 'amr'; did you mean 'arm'? valid: arm, base, body, ee, manu"),
-        (
-            "arm3.length=0.3..0.4",
-            "a range of a parameter is a rule of morphgen 0.3 alone; audit the",
-        ),
+        ("arm3.length=0.3..0.4", "a range of a parameter is a rule of morphgen 0.3 alone; audit"),
         ("arm", "--hold-out arm: expected KEY=VALUE, such as arm=kinova*, manufacturer=Kinova"),
         ("arm=ur5,", "--hold-out arm=ur5,: empty rule: expected KEY=VALUE"),
         ("arm=ur5,arm=ur5", "arm=ur5 is there twice"),

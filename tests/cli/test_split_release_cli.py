@@ -191,8 +191,8 @@ def test_episodes_of_a_submission_are_run_again(run, refused, small, monkeypatch
     for robot in values["robots"]:
         robot["distance"] = [each + 0.01 for each in robot["distance"]]
     Path("a.json").write_text(json.dumps(values))
-    code, out, _ = run(*score, "--seed", "3")
-    assert code == 1
+    code, out, err = run(*score, "--seed", "3")
+    assert (code, "; running the whole evaluation\n" in err) == (1, True)
     assert len(re.findall(r"a\.json: \w+ robot \S+, episode [01]: .*: DIFFERS: again ", out)) == 2
     errors = {"mine": "expected one with --checkpoint RUN", "scripted": " for reach"}
     for method, error in errors.items():

@@ -23,7 +23,7 @@ from morphgen.benchmark.scores.results import NOTE, result_rows, result_tables, 
 from morphgen.benchmark.scores.submission import Submission, protocol_from
 from morphgen.errors import BenchmarkError, MorphgenError, TaskError
 from morphgen.formats.files import LOCK, write_file
-from morphgen.progress import stage
+from morphgen.progress import note, stage
 from morphgen.rl.agents import AGENTS
 from morphgen.rl.baselines import BASELINES
 from morphgen.rl.demonstrations.recording import TOLERANCE
@@ -436,6 +436,10 @@ def replay_submission(
             if all(each.agrees for each in found):
                 yield from found
                 continue
+            note(
+                f"morphgen: {where}: episodes of {side} robots end otherwise alone, where numbers "
+                "are rounded otherwise; running the whole evaluation"
+            )
         outcomes = {score.robot: score.outcomes for score in run_whole(of_side)} if own else {}
         for robot, number in own:
             whole = outcomes[robot.robot]
