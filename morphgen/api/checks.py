@@ -23,9 +23,7 @@ from morphgen.model.findings import Finding
 from morphgen.model.robot import Robot
 
 
-def check(
-    robot: RobotLike, *, tool_required: bool = True, library: LibraryFolders = ()
-) -> tuple[Finding, ...]:
+def check(robot: RobotLike, *, library: LibraryFolders = ()) -> tuple[Finding, ...]:
     """Find faults of a robot, with a repair for each.
 
     Examples:
@@ -35,8 +33,6 @@ def check(
 
     Args:
         robot: The robot, its bundle's folder, a description, or words of ``compose``.
-        tool_required: Whether a missing tool is a finding; without effect for a file that is not
-            a bundle, which need not have one.
         library: Folders of your own parts.
 
     Returns:
@@ -46,8 +42,8 @@ def check(
         MorphgenError: If the robot cannot be composed or read.
     """
     if isinstance(robot, Robot):
-        return checks.check(robot, tool_required=tool_required)
-    return check_source(find_robot(robot), default_library(library), tool_required=tool_required)
+        return checks.check(robot)
+    return check_source(find_robot(robot), default_library(library))
 
 
 def fix(robot: RobotLike, *, library: LibraryFolders = ()) -> tuple[Robot, tuple[Finding, ...]]:
@@ -67,24 +63,16 @@ def fix(robot: RobotLike, *, library: LibraryFolders = ()) -> tuple[Robot, tuple
 
 
 def check_source(
-    source: RobotReference,
-    library: Library,
-    root: Path | None = None,
-    *,
-    tool_required: bool = True,
+    source: RobotReference, library: Library, root: Path | None = None
 ) -> tuple[Finding, ...]:
-    """Find faults of a robot, also those of an unsound file, and of a bundle's files.
-
-    root: A folder that meshes, includes and YAML may come from, besides the description's own.
-    tool_required: Whether a missing tool is a finding; never for a file without a card.
-    """
+    """Find faults of a robot, also an unsound one, and of a bundle; a lone URDF needs no tool."""
     try:
         robot = read_source(source, library, root)
     except UnsoundError as error:
         return error.findings
     folder = bundle_of(source)
-    required = tool_required and (folder is not None or source.path is None)
-    findings = checks.check(robot, tool_required=required)
+    is_robot = folder is not None or source.path is None
+    findings = checks.check(robot, tool_required=is_robot)
     return (*findings, *file_findings(folder)) if folder is not None else findings
 
 

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import SimpleNamespace
 
 from morphgen.api.checks import bundle_of
 from morphgen.checks.srdf import curobo_text, robot_srdf_text
@@ -79,71 +79,63 @@ def export(
         MissingDependencyError: If the extra that the format needs is not installed.
         MorphgenError: If the robot cannot be read or written.
     """
-    given = SimpleNamespace(**locals())
-    given.out = None if out is None else path_argument("out", out, FormatError)
+    out = None if out is None else path_argument("out", out, FormatError)
     if text_argument("format", format, FormatError) not in (valid := (*FILES, *FOLDERS)):
         raise FormatError(f"unknown format {format!r}{nearest(format, valid)}")
     parts, source = default_library(library), None
     if not isinstance(robot, Robot):
         source = find_robot(robot)
         robot = read_source(source, parts)
-    return write_export(source, robot, given)
+    return write_export(source, robot, format, out)
 
 
 def write_export(
     source: RobotReference | None,
     robot: Robot,
-    given: SimpleNamespace,
+    format: str,
+    out: Path | None,
     taken: Collection[Path] = (),
 ) -> Path:
     """Write the file or folder of a robot, and return its path, which others may have taken."""
-    path = _target(source, robot, given)
+    path = _target(source, robot, format, out)
     if source is not None and path in taken:
         raise FormatError(f"{source.label}: {path} is of another robot of this command already")
-    if given.format in FILES:
-        content = FILES[given.format](robot, given)
+    if format in FILES:
+        content = FILES[format](robot)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, content)
     else:
-        with writing_export(path, given.format, robot.name) as folder:
-            FOLDERS[given.format](robot, folder, given)
+        with writing_export(path, format, robot.name) as folder:
+            FOLDERS[format](robot, folder)
     return path
 
 
-def _target(source: RobotReference | None, robot: Robot, given: SimpleNamespace) -> Path:
-    bundle = bundle_of(source) if given.out is None and source is not None else None
-    if bundle is not None and given.format in FILES:
-        return bundle / f"robot.{given.format}"
+def _target(source: RobotReference | None, robot: Robot, format: str, out: Path | None) -> Path:
+    bundle = bundle_of(source) if out is None and source is not None else None
+    if bundle is not None and format in FILES:
+        return bundle / f"robot.{format}"
     beside = Path() if bundle is None else Path(os.path.normpath(bundle / ".."))
-    path = bundle_folder(given.out or beside, robot.name)
-    if given.format == "ros2":
+    path = bundle_folder(out or beside, robot.name)
+    if format == "ros2":
         return path.with_name(ros_package_name(robot.name))
-    if given.format in FOLDERS:
-        return path.with_name(f"{robot.name}-{given.format}")
-    return path.with_name(f"{path.name}.{given.format}")
+    if format in FOLDERS:
+        return path.with_name(f"{robot.name}-{format}")
+    return path.with_name(f"{path.name}.{format}")
 
 
-def _html(robot: Robot, given: SimpleNamespace) -> bytes:
+def _html(robot: Robot) -> bytes:
     from morphgen.viewer.robot_files import robot_page  # of an extra, and seconds to import
 
     return robot_page(robot)
 
 
-def _video(robot: Robot, given: SimpleNamespace) -> bytes:
+def _video(suffix: str, robot: Robot) -> bytes:
     from morphgen.viewer.robot_files import turntable  # of an extra, and seconds to import
 
-    return turntable(robot, f".{given.format}")
+    return turntable(robot, suffix)
 
 
-def _glb(robot: Robot, given: SimpleNamespace) -> bytes:
-    return glb_bytes(split_colours(robot))
-
-
-def _srdf(robot: Robot, given: SimpleNamespace) -> bytes:
-    return robot_srdf_text(robot).encode()
-
-
-def _with_meshes(robot: Robot, folder: Path, texts: str) -> None:
+def _with_meshes(texts: str, robot: Robot, folder: Path) -> None:
     """Write meshes and the texts of a format, which name them by relative paths."""
     robot = split_colours(robot)
     files = write_meshes(robot, folder / MESHES)
@@ -153,23 +145,15 @@ def _with_meshes(robot: Robot, folder: Path, texts: str) -> None:
         write_fits(robot, folder)
 
 
-def _meshed(robot: Robot, folder: Path, given: SimpleNamespace) -> None:
-    _with_meshes(robot, folder, given.format)
-
-
-def _curobo(robot: Robot, folder: Path, given: SimpleNamespace) -> None:
+def _curobo(robot: Robot, folder: Path) -> None:
     (folder / "robot.yml").write_text(curobo_text(robot, URDF), encoding="utf-8")
-    _with_meshes(robot, folder, "urdf")
+    _with_meshes("urdf", robot, folder)
 
 
-def _usd(robot: Robot, folder: Path, given: SimpleNamespace) -> None:
+def _usd(robot: Robot, folder: Path) -> None:
     with TemporaryDirectory() as scratch:
-        _with_meshes(robot, Path(scratch), "urdf")
+        _with_meshes("urdf", robot, Path(scratch))
         convert_urdf(Path(scratch) / URDF, folder)
-
-
-def _ros2(robot: Robot, folder: Path, given: SimpleNamespace) -> None:
-    write_ros_package(robot, folder, robot_srdf_text(robot))
 
 
 TEXTS: Mapping[str, Callable[[Robot, MeshUri], Mapping[str, str]]] = {
@@ -181,21 +165,19 @@ TEXTS: Mapping[str, Callable[[Robot, MeshUri], Mapping[str, str]]] = {
     },
 }
 """Functions that return a robot's texts by their names, by the format's name."""
-FILES: Mapping[str, Callable[[Robot, SimpleNamespace], bytes]] = {
+FILES: Mapping[str, Callable[[Robot], bytes]] = {
     "html": _html,
-    "mp4": _video,
-    "gif": _video,
-    "glb": _glb,
-    "srdf": _srdf,
+    "mp4": partial(_video, ".mp4"),
+    "gif": partial(_video, ".gif"),
+    "glb": lambda robot: glb_bytes(split_colours(robot)),
+    "srdf": lambda robot: robot_srdf_text(robot).encode(),
 }
 """Functions that return the content of a robot's file, by the format's name, which is its suffix.
 """
-FOLDERS: Mapping[str, Callable[[Robot, Path, SimpleNamespace], None]] = {
-    "urdf": _meshed,
-    "mjcf": _meshed,
-    "sdf": _meshed,
+FOLDERS: Mapping[str, Callable[[Robot, Path], None]] = {
+    **{name: partial(_with_meshes, name) for name in TEXTS},
     "curobo": _curobo,
     "usd": _usd,
-    "ros2": _ros2,
+    "ros2": lambda robot, folder: write_ros_package(robot, folder, robot_srdf_text(robot)),
 }
 """Functions that write a robot's files into an empty folder, by the format's name."""

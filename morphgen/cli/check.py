@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from types import SimpleNamespace
 
 from morphgen import checks
 from morphgen.api.checks import bundle_of, check_source, conform_source
@@ -187,10 +186,11 @@ def export(args: argparse.Namespace) -> int:
 
     if args.out is not None:
         require_writable_folder(args.out)
-    given, paths = SimpleNamespace(**vars(args)), list[Path]()
+    paths: list[Path] = []
 
     def write(source: RobotReference, library: Library) -> None:
-        paths.append(write_export(source, read_source(source, library, args.root), given, paths))
+        robot = read_source(source, library, args.root)
+        paths.append(write_export(source, robot, args.format, args.out, paths))
 
     _, refused = opt.for_each_robot(args, "exporting", write)
     refusals = [{"robot": label, **error} for label, error in refused.items()]
