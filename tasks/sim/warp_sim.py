@@ -554,7 +554,8 @@ def load_kernels(groups: Sequence[Group], device: str) -> None:
     H100 with 16 cores the first start took 183 s so, and takes 27 s.
     """
     modules = kernels_of(groups, device)
-    if not kernels_stored(wp.get_device(device).arch):
+    suffix = f".sm{wp.get_device(device).arch}.cubin"
+    if not any(Path(wp.config.kernel_cache_dir).rglob(f"*{suffix}")):
         _log.warning("compiling %s parts of MuJoCo Warp for this GPU, once", len(modules))
     last = time.monotonic()
     with ThreadPoolExecutor(usable_cores()) as pool:
@@ -588,11 +589,6 @@ def kernels_of(groups: Sequence[Group], device: str) -> list[tuple[wp.Module, in
         for group in groups:
             group.step()
     return list(found)
-
-
-def kernels_stored(arch: int) -> bool:
-    """Return whether an earlier start compiled kernels for GPUs of an architecture."""
-    return any(Path(wp.config.kernel_cache_dir).rglob(f"*.sm{arch}.cubin"))
 
 
 SIMULATOR = Simulator(

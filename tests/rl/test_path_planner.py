@@ -26,7 +26,7 @@ from morphgen.rl.inference import run_episodes
 from morphgen.splits.split import read_split
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.configs import PushConfig, ReachConfig
-from morphgen.tasks.free_space import RESOLUTION, FreeSpace
+from morphgen.tasks.free_space import FreeSpace
 from morphgen.tasks.registry import SIMULATORS, TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig, member_spec
 from morphgen.tasks.scenes.make import batch_from_specs, make_batch
@@ -190,23 +190,6 @@ def test_robots_pass_waypoints_that_the_smallest_bin_cannot_reach(made, kind):
     assert finished.all()
     step = batch.robot_tables.max_step[0]
     assert ((batch.targets[0] - torch.from_numpy(goal)).abs() <= step / 16 + 1e-6).all()
-
-
-@pytest.mark.parametrize("resolution", [RESOLUTION, RESOLUTION / 5])
-@pytest.mark.parametrize("far", [0.0, 0.0501, 0.0999, 0.52])
-def test_tested_configurations_are_no_farther_apart_than_the_resolution(
-    far, resolution, monkeypatch
-):
-    space, tested, free = space_of(), [], FreeSpace.free
-    monkeypatch.setattr(
-        FreeSpace, "free", lambda *args, **stop: tested.append(args[1]) or free(*args, **stop)
-    )
-    start = np.array([-0.5, -0.5])
-    end = start + np.array([far, far / 3])
-    planner = PathPlanner(space, STEP, 0, resolution=resolution)
-    assert planner.plan_straight(start, end[None]) is not None
-    assert tested[-1][[0, -1]] == pytest.approx(np.array([end, start]))
-    assert np.abs(np.diff(tested[-1], axis=0)).max() <= resolution + 1e-12
 
 
 def test_joints_of_two_turns_take_the_shorter_way(made, monkeypatch):

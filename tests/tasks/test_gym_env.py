@@ -408,19 +408,13 @@ def test_closed_environment_raises_a_clear_error(made):
             use()
 
 
-@pytest.mark.parametrize(
-    ("action", "message"),
-    [
-        (np.zeros(23, np.float32), r"shape \(23,\); expected \(5,\): arm_base, arm_shoulder"),
-        (np.float32(0), r"shape \(\); expected \(5,\)"),
-        (np.full(5, np.nan, np.float32), "not finite"),
-    ],
-)
-def test_invalid_actions_are_rejected(made, action, message):
+def test_invalid_actions_are_rejected(made):
     env = made()
     env.reset(seed=0)
-    with pytest.raises(TaskError, match=message):
-        env.unwrapped.step(action)
+    with pytest.raises(TaskError, match=r"shape \(23,\); expected \(5,\): arm_base, arm_shoulder"):
+        env.unwrapped.step(np.zeros(23, np.float32))
+    with pytest.raises(TaskError, match="not finite"):
+        env.unwrapped.step(np.full(5, np.nan, np.float32))
 
 
 def test_mujoco_is_the_default_whatever_is_installed(made):

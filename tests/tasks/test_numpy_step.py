@@ -159,17 +159,6 @@ def test_an_object_at_its_goal_terminates_as_in_the_batch(make, task, number, be
         assert result[2] is result[4]["success"] is succeeds
 
 
-def test_curriculum_moves_the_line_within_an_episode(make):
-    env, _ = make("push")
-    action = np.zeros(env.action_space.shape, np.float32)
-    env.reset(seed=1)
-    lines = []
-    for progress in (0.0, 0.2, 1.0):
-        env.batch.advance(progress)
-        lines.append(float(env.step(action)[0]["line"][0]))
-    assert lines[0] > lines[1] > lines[2] == pytest.approx(CONFIGS["push"].line)
-
-
 @pytest.mark.parametrize("task", ["reach", "push", "door"])
 def test_all_channels_equal_those_of_the_batch(make, task):
     run_both(*make(task, observe=CHANNELS, obstacles=task not in OBJECTS), 1)

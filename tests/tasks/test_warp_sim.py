@@ -270,14 +270,6 @@ def test_the_kernels_of_a_step_are_known_before_it_is_launched(shared, monkeypat
     assert set(wanted) <= set(found)
 
 
-def test_kernels_of_another_gpu_do_not_count_as_compiled(tmp_path, monkeypatch):
-    monkeypatch.setattr(warp_sim.wp.config, "kernel_cache_dir", str(tmp_path))
-    (tmp_path / "module").mkdir()
-    (tmp_path / "module" / "module.sm90.cubin").touch()
-    assert warp_sim.kernels_stored(90)
-    assert not warp_sim.kernels_stored(80)
-
-
 @pytest.mark.parametrize("task", [pytest.param("reach", marks=pytest.mark.slow), "push"])
 def test_a_batch_has_the_episodes_and_nearly_the_steps_of_mujoco(task):
     """The same seed gives the same starts and goals, and the same actions the same rewards."""
