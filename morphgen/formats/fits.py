@@ -200,6 +200,8 @@ def fits_text(fits: Mapping[str, StoredFit]) -> str:
 def shape_to_data(shape: Shape) -> dict[str, object]:
     """Return the data of a ``ShapeRecord`` for a primitive."""
     geometry, pose = shape.geometry, shape.T_link_shape
+    if isinstance(geometry, Mesh):
+        raise ValueError(f"mesh {geometry.path} is not a primitive")
     return {
         _KINDS[type(geometry)]: list(dimensions(geometry)),
         "xyz": list(pose.position),

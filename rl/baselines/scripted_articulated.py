@@ -19,7 +19,7 @@ from morphgen.model.kinematics import unwrap_joints
 from morphgen.rl.baselines.path_planner import Path, PathCost, PathPlanner
 from morphgen.rl.baselines.scripted_push import LEAD_STEP, SPEED, ScriptedController, ScriptedPush
 from morphgen.tasks.articulated.envs import ArticulatedEnvs
-from morphgen.tasks.articulated.task import ArticulatedStartSet, PathFinder
+from morphgen.tasks.articulated.task import ArticulatedStartSet, PathFinder, points_behind
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.push.task import BEHIND
 from morphgen.tasks.scenes.robot_tables import RobotTables
@@ -160,7 +160,7 @@ class MotionPlanner:
         starts, goals, owners = [], [], []
         for distance in BEHIND:
             poses = finder.motions(*ends, distance, TRACK)
-            behind = finder.behind(poses[0], sign, distance * edge)
+            behind = points_behind(self._thing, poses[0], sign, distance * edge)
             nearest = finder.nearest(behind[:, 0])
             for i, motion in enumerate(motions):
                 begin = motion.attempt * _NEAREST

@@ -270,8 +270,14 @@ def _draw_motions(
 def points_behind(
     thing: ArticulatedObject, poses: Array, sign: Array, distance: Array | float
 ) -> Array:
-    """Return points in the world from where tools push, (n, 3) [m]; see ``behind``."""
-    return np.asarray(poses[:, :3] + rotated(poses[:, 3:], thing.behind(sign, distance)))
+    """Return points from where tools push along motions (n, P, 7), (n, P, 3) [m]; see ``behind``.
+
+    Signs and distances are those of the motions, (n,).
+    """
+    n, count, _ = poses.shape
+    flat, distances = poses.reshape(-1, 7), np.broadcast_to(distance, n).repeat(count)
+    offsets = rotated(flat[:, 3:], thing.behind(sign.repeat(count), distances))
+    return np.asarray(flat[:, :3] + offsets).reshape(n, count, 3)
 
 
 class PathFinder:
@@ -322,7 +328,7 @@ class PathFinder:
         for distance in BEHIND:
             rows = np.flatnonzero(np.isnan(distances))
             motions = self.motions(start[rows], goal[rows], distance)
-            behind = self.behind(motions[0], sign[rows], distance * self._edge)
+            behind = points_behind(self.thing, motions[0], sign[rows], distance * self._edge)
             near = self.nearest(behind[:, 0])[:, : sum(_NEAREST)]
             begin = 0
             for count in _NEAREST:  # most succeed from the nearest, which spares the others
@@ -357,12 +363,6 @@ class PathFinder:
         backs = against(self.thing, start, goal, distance * self._edge, self._edge)
         shifts = (np.zeros_like(start), *backs)
         return [motion_poses(self.thing, start + each, goal + each, count) for each in shifts]
-
-    def behind(self, poses: Array, sign: Array, distance: float) -> Array:
-        """Return points behind the object along motions (n, P, 7), shape (n, P, 3) [m]."""
-        n, count, _ = poses.shape
-        flat = points_behind(self.thing, poses.reshape(-1, 7), sign.repeat(count), distance)
-        return flat.reshape(n, count, 3)
 
     def follow(
         self, candidates: NDArray[np.int64], goals: Array, poses: Array, *nearer: Array
@@ -444,12 +444,7 @@ def start_faults(starts: ArticulatedStartSet, space: FreeSpace) -> Iterator[str]
     poses = motion_poses(thing, starts.start, starts.goal)
     low, high = thing.joint.limits or (-np.pi, np.pi)
     ends = np.stack([starts.start, starts.goal])
-    behind = points_behind(
-        thing,
-        poses.reshape(-1, 7),
-        np.sign(starts.goal - starts.start).repeat(POINTS),
-        starts.distance.repeat(POINTS),
-    ).reshape(n, POINTS, 3)
+    behind = points_behind(thing, poses, np.sign(starts.goal - starts.start), starts.distance)
     path = starts.path.reshape(n * POINTS, -1).astype(np.float64)
     tools = MujocoKinematics(space.scene.robot).frame_pose(path)[:, :3, 3].reshape(n, POINTS, 3)
     away = np.abs(tools - behind)
