@@ -50,14 +50,7 @@ from morphgen.formats.rounding import round_number
 from morphgen.grammar.library import Library, default_library
 from morphgen.model.kinematics import reach_from_root
 from morphgen.rl.runs.robot_source import read_drawn
-from morphgen.splits.split import (
-    Member,
-    RobotFactory,
-    Split,
-    compose_member,
-    read_split,
-    recipe_of,
-)
+from morphgen.splits.split import Member, RobotFactory, Split, compose_member, read_split, recipe_of
 from morphgen.typing import Array
 from robot_curve import REAL_ARMS, VARIANTS, policy_name, read_scores
 

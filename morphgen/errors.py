@@ -203,11 +203,7 @@ def whole_number(
 
 
 def require_types(
-    function: Callable[..., object],
-    given: SimpleNamespace,
-    error: type[MorphgenError],
-    *texts: str,
-    **least: int,
+    function: Callable[..., object], given: SimpleNamespace, *texts: str, **least: int
 ) -> None:
     """Require arguments of a function to be texts, and others whole numbers, made ``int``.
 
@@ -216,11 +212,11 @@ def require_types(
     defaults = {name: each.default for name, each in signature(function).parameters.items()}
     not_given = {name for name in defaults if defaults[name] is getattr(given, name) is None}
     for name in (each for each in texts if each not in not_given):
-        text_argument(name, getattr(given, name), error)
+        text_argument(name, getattr(given, name), TaskError)
     for name in (each for each in least if each not in not_given):
-        setattr(given, name, whole_number(name, getattr(given, name), error, least[name]))
+        setattr(given, name, whole_number(name, getattr(given, name), TaskError, least[name]))
         if getattr(given, name) > MAX_WHOLE:
-            raise error(f"{name}: expected at most 2^63 - 1")
+            raise TaskError(f"{name}: expected at most 2^63 - 1")
 
 
 def truth(name: str, value: object, error: type[MorphgenError]) -> bool:

@@ -28,12 +28,7 @@ from morphgen.rl.observation_layout import (
     with_fields,
 )
 from morphgen.rl.policies import make_networks, rows_needed
-from morphgen.rl.runs.checkpoint import (
-    Interface,
-    RunConfig,
-    policy_interface,
-    read_checkpoint,
-)
+from morphgen.rl.runs.checkpoint import Interface, RunConfig, policy_interface, read_checkpoint
 from morphgen.rl.shipped_policies import checkpoint_path, name_of, policies_for, tasks_of
 from morphgen.tasks.batch import Step, TaskBatch
 from morphgen.tasks.observation import Observation

@@ -248,7 +248,6 @@ train("prims task=reach", sim="mujco") => did you mean 'mujoco'
 train("prims task=reach", sim=3) => sim 3: expected a text
 train("prims task=reach", robot_seed=1) => only with drawn
 evaluate("ik", "prims task=reach", mode="best") => unknown mode 'best'; valid: deter
-evaluate("ik", "prims task=reach", episodes=0) => episodes 0: expected a whole num
 evaluate("ik", "prims task=reach", episodes=None) => episodes None: expected a whole num
 evaluate("zero-shot", goal_seed=1) => goal_seed and library: only with robots
 evaluate("zero-shot", method="mine") => method: only with submission

@@ -110,7 +110,7 @@ def record(
     """
     given = SimpleNamespace(**locals())
     least = {"episodes": 1, "seed": 0, "robot_seed": 0, "goal_seed": 0, "jobs": 1}
-    require_types(record, given, TaskError, "drawn", "sim", "goal", hold=1, **least)
+    require_types(record, given, "drawn", "sim", "goal", hold=1, **least)
     require_side(on)
     if not 0 <= noise < 10:
         raise TaskError(f"noise {noise}: expected a standard deviation from 0 to 10")
@@ -282,7 +282,7 @@ def clone(
     """
     given = SimpleNamespace(**locals())
     least = {"minibatch": 1, "rounds": 1, "episodes": 1, "jobs": 1, "minutes": 1, "seed": 0}
-    require_types(clone, given, TaskError, "agent", "preset", "dagger", "device", **least)
+    require_types(clone, given, "agent", "preset", "dagger", "device", **least)
     if not 0 < epochs <= MAX_EPOCHS:
         raise TaskError(f"epochs {epochs}: expected more than 0, and at most {MAX_EPOCHS:,}")
     if isinstance(demonstrations, str | PathLike):

@@ -120,7 +120,7 @@ def evaluate(
     """
     given = SimpleNamespace(**locals())
     least = {"episodes": 1, "workers": 1, "seed": 0, "goal_seed": 0}
-    require_types(evaluate, given, TaskError, "sim", "device", "goal", "method", **least)
+    require_types(evaluate, given, "sim", "device", "goal", "method", **least)
     if on is not None:
         require_side(on)
     if mode not in (None, *MODES):
@@ -182,7 +182,7 @@ def play(
         MorphgenError: If the robot cannot be read, or cannot do the task.
     """
     given = SimpleNamespace(**locals())
-    require_types(play, given, TaskError, "sim", "goal", episodes=1, seed=0)
+    require_types(play, given, "sim", "goal", episodes=1, seed=0)
     spec = read_controller(str(policy), text_argument("task", task, TaskError))
     video = None if out is None else path_argument("out", out, TaskError)
     if video is not None:

@@ -169,7 +169,7 @@ def train(
     texts = ("agent", "preset", "sim", "device", "drawn", "goal")
     least = {"minutes": 1, "robot_seed": 0, "train_goals": 2, "max_links": 2}
     least |= {"steps": 1, "envs": 1, "workers": 1, "seed": 0, "goal_seed": 0}
-    require_types(train, given, TaskError, *texts, **least)
+    require_types(train, given, *texts, **least)
     require_side(on)
     spec = parse_agent(agent)
     if drawn is None:

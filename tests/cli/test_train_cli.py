@@ -323,8 +323,7 @@ def test_drawn_robots_are_trained_on_and_others_evaluated_and_played(run, ok, tm
 
     (folder / FILE).unlink()
     code, _, err = run("eval", folder, "--split", "own.yaml", "--on", "test", *evaluation)
-    assert code == 0
-    assert f"{folder} has no robots.json: it is unknown whether" in err
+    assert (code, f"{folder} has no robots.json: it is unknown whether" in err) == (0, True)
 
 
 @pytest.mark.parametrize(
@@ -366,8 +365,7 @@ def test_held_out_robots_are_skipped_and_fit_the_observations(run, refused, tmp_
     write_split(large, tmp_path / "own.yaml")
     options = ("--held-out", "own.yaml", "--steps", "32", "--out", "run")
     code, _, err = run(*RUN_DRAWN, "cubes:2", *options)
-    assert code == 0
-    assert "morphgen: robots that were skipped: 1 held out\n" in err
+    assert (code, "morphgen: robots that were skipped: 1 held out\n" in err) == (0, True)
     assert [each.name for each in read_drawn(Path("run"))] == ["cubes-000000", "cubes-000002"]
     config = read_config(Path("run"))
     assert config.source.held_out == (str(tmp_path / "own.yaml"),)

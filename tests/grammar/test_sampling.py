@@ -242,11 +242,7 @@ def test_a_set_that_fails_later_keeps_its_robots(tmp_path):
 
 def interrupted(plan, n, done):
     """Make a set that stops like a killed process after some robots."""
-
-    class Killed(BaseException):
-        pass
-
-    stopped(plan, n, done, Killed())
+    stopped(plan, n, done, SystemExit())
 
 
 def test_a_light_set_has_one_folder_per_robot_an_index_and_the_grammar(whole):

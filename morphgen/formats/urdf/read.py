@@ -100,7 +100,7 @@ def require_description_file(path: Path) -> None:
         why = "not a regular file" if path.exists() else "no such file"
         raise FormatError(f"{path}: {why}")
     if path.suffix.lower() in MESH_SUFFIXES:
-        valid = "a bundle, URDF, xacro or MJCF; `morphgen fit` takes a mesh, one at a time"
+        valid = "a bundle, URDF, xacro or MJCF; `morphgen fit` takes a mesh"
         raise FormatError(f"{path}: a mesh; expected {valid}")
     if str(path).encode(errors="replace").decode() != str(path):
         raise FormatError(f"{str(path)!a}: the file's name is not UTF-8 text")
