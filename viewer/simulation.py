@@ -225,10 +225,10 @@ def _demonstrations(folder: str, files: FileAccess) -> Demonstrations:
 
 def list_episodes(
     folder: str, files: FileAccess
-) -> tuple[list[tuple[str, str]], list[tuple[int, str, bool]]]:
-    """Return robots of demonstrations, and of each episode the robot's number, task and success."""
+) -> tuple[list[tuple[str, str]], list[tuple[int, bool]]]:
+    """Return the robots of demonstrations, and the robot's number and success of each episode."""
     demos = _demonstrations(folder, files)
-    episodes = [(each.robot_index, each.task, each.success) for each in demos.episodes]
+    episodes = [(each.robot_index, each.success) for each in demos.episodes]
     return [*zip(demos.robot_names, demos.robot_hashes, strict=True)], episodes
 
 

@@ -396,8 +396,7 @@ def score_table(episode: Episode, step: int) -> str:
     return head + markup.table(header, rows, (1, 2))
 
 
-ANY = "any"  # choice of a robot, task or outcome that leaves no episode out
-OUTCOMES = ("failure", "success")
+MAX_FAILURES = 30  # largest number of failed episodes that the page of demonstrations lists
 
 
 def show_demos(session: Session) -> None:
@@ -409,28 +408,25 @@ def show_demos(session: Session) -> None:
     header = markup.breadcrumbs((uri_name(folder), None))
     session.open_panel(PANEL_WIDTH, header, "reading")
     robots, episodes = session.simulator.call(rollout.simulation("list_episodes"), folder, files)
-    names, count = [name for name, _ in robots], len(episodes)
-    labels = [name if names.count(name) == 1 else f"{name} {key}" for name, key in robots]
-    rows = [(labels[body], task, OUTCOMES[success]) for body, task, success in episodes]
-    robot = gui.add_dropdown("robot", (ANY, *labels), hint="type to search")
-    task = gui.add_dropdown("task", (ANY, *dict.fromkeys(task for _, task, _ in rows)))
-    outcome = gui.add_dropdown("outcome", (ANY, *OUTCOMES))
-    choices = (robot, task, outcome)
-    number = gui.add_number("episode", 0, min=0, max=count - 1, step=1)
-    move = gui.add_button_group("go to", ("previous", "next"))
+    names, firsts = [name for name, _ in robots], dict[str, int]()
+    for index, (body, _) in enumerate(episodes):
+        name, key = robots[body]
+        firsts.setdefault(name if names.count(name) == 1 else f"{name} {key}", index)
+    robot = gui.add_dropdown("first of", tuple(firsts), hint="type to search")
+    number = gui.add_number("episode", 0, min=0, max=len(episodes) - 1, step=1)
+    failures = [index for index, (_, success) in enumerate(episodes) if not success]
+    addresses = (Address("demos", (folder,), {"episode": str(index)}) for index in failures)
+    links = [markup.link(each, each.state["episode"]) for each in addresses][:MAX_FAILURES]
+    listed = f": {', '.join(links)}" + ", ..." * (len(failures) > MAX_FAILURES) if links else ""
+    gui.add_html(markup.framed(f"{len(failures)} of {len(episodes)} episodes failed{listed}"))
     page = PlayPage(session)
     facts = gui.add_html("")
-    bind(session, "body", robot, (ANY, *(key for _, key in robots)))
-    bind(session, "task", task)
-    bind(session, "outcome", outcome)
     bind(session, "episode", number)
 
-    def play(*, is_recorded: bool = True) -> None:
+    def play() -> None:
         index = number.value
 
         def read() -> rollout.EpisodeSource:
-            if not is_recorded:
-                raise MorphgenError("no such episode was recorded")
             episode = session.simulator.call(
                 rollout.simulation("recorded_episode"), folder, index, files
             )
@@ -440,30 +436,14 @@ def show_demos(session: Session) -> None:
         session.title = f"{uri_name(folder)} {index}"
         page.load(read)
 
-    def seek(start: int, direction: int = 1) -> None:
-        """Play the first episode from a number on, or back from it, that the choices allow."""
-        allowed = [
-            index
-            for index, row in enumerate(rows)
-            if all(choice.value in (ANY, own) for choice, own in zip(choices, row, strict=True))
-        ]
-        if allowed:
-            set_value(number, min(allowed, key=lambda index: direction * (index - start) % count))
-        play(is_recorded=bool(allowed))
+    def jump() -> None:
+        set_value(number, firsts[robot.value])
+        play()
 
-    def step() -> None:
-        direction = 1 if move.value == "next" else -1
-        seek(number.value + direction, direction)
-
-    for choice in choices:
-        session.on_change(choice, lambda: seek(number.value), "seek")
+    session.on_change(robot, jump, "play")
     session.on_change(number, play, "play")
-    session.on_change(move, step)
     session.apply_state()
-    if 0 <= number.value < count:
-        seek(number.value)  # an address may name an episode that its other choices leave out
-    else:
-        play()  # says that there is no such episode
+    play()
     page.add_download()
 
 
