@@ -2,6 +2,7 @@
 
 import gc
 import sys
+from contextlib import ExitStack, closing
 from dataclasses import replace
 
 import pytest
@@ -32,6 +33,13 @@ def module_cache(tmp_path_factory):
 def cache(tmp_path_factory):
     """Folder of stored goal sets, which the tests of a process share."""
     return tmp_path_factory.mktemp("goals")
+
+
+@pytest.fixture
+def opened():
+    """Return a function that returns what it is given, which is closed after the test."""
+    with ExitStack() as stack:
+        yield lambda thing: stack.enter_context(closing(thing))
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """The planner of paths, and the scripted controllers of push and of articulated objects."""
 
 import math
-from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -162,18 +161,15 @@ CLAW, CHAIN = "arm=arm3 ee=claw", "nlink"
 
 
 @pytest.fixture
-def made(tmp_path):
-    opened = []
-
+def made(tmp_path, opened):
     def make(words, n, **options):
         given = {"cache": tmp_path, "configs": (REACH,), "sim": "mujoco", **options}
-        opened.append(make_batch("reach", [robot(each) for each in words.split(", ")], n, **given))
-        opened[-1].reset()
-        return opened[-1]
+        robots = [robot(each) for each in words.split(", ")]
+        batch = opened(make_batch("reach", robots, n, **given))
+        batch.reset()
+        return batch
 
-    yield make
-    for batch in opened:
-        batch.close()
+    return make
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
@@ -357,44 +353,46 @@ def test_the_overhang_of_a_brim_is_its_lead(ahead, over):
     assert pushing.overhang(space, q, blocks, 0.4) == pytest.approx([over, 0], abs=0.0035)
 
 
-def batch(words, n, cache, task="push", **options):
-    robots = [robot(each) for each in words]
-    return make_batch(task, robots, n, cache=cache, configs=(FEW_REACH, PUSH), **options)
+@pytest.fixture
+def batch(tmp_path, opened):
+    def make(words, n, task="push", sim="mujoco", **options):
+        given = {"cache": tmp_path, "configs": (FEW_REACH, PUSH), "sim": sim, **options}
+        return opened(make_batch(task, [robot(each) for each in words], n, **given))
+
+    return make
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sim", [PYBULLET, "mujoco"])
 @pytest.mark.parametrize("words", [UR5, PANDA, PLANE])
-def test_four_of_five_blocks_cross_the_line(words, sim, tmp_path):
-    with closing(batch([words], 20, tmp_path, sim=sim)) as task:
-        assert sum(each.success for each in run_episodes(task, ScriptedPush(0), 1)) >= 16
+def test_four_of_five_blocks_cross_the_line(words, sim, batch):
+    episodes = run_episodes(batch([words], 20, sim=sim), ScriptedPush(0), 1)
+    assert sum(each.success for each in episodes) >= 16
 
 
 @pytest.mark.slow
-def test_actions_may_be_discrete(tmp_path):
-    with closing(batch([PLANE], 3, tmp_path, sim="mujoco", kind="discrete")) as task:
-        assert sum(each.success for each in run_episodes(task, ScriptedPush(0), 1)) >= 2
+def test_actions_may_be_discrete(batch):
+    episodes = run_episodes(batch([PLANE], 3, kind="discrete"), ScriptedPush(0), 1)
+    assert sum(each.success for each in episodes) >= 2
 
 
 @pytest.mark.slow
-def test_the_seed_determines_the_actions(tmp_path):
+def test_the_seed_determines_the_actions(batch):
     def actions(seed):
-        task, controller = batch([UR5], 2, tmp_path, sim="mujoco"), ScriptedPush(seed)
+        task, controller = batch([UR5], 2), ScriptedPush(seed)
         task.reset()
         found = []
         for _ in range(30):
             found.append(controller.act(task))
             task.step(found[-1])
-        task.close()
         return torch.stack(found)
 
     assert torch.equal(actions(0), actions(0))
     assert not torch.equal(actions(0), actions(1))
 
 
-def test_actions_are_in_range_and_reach_robots_do_not_move(tmp_path):
-    task = batch([UR5, PLANE], 4, tmp_path, task=["reach", "push"], sim="mujoco")
-    controller = ScriptedPush(0)
+def test_actions_are_in_range_and_reach_robots_do_not_move(batch):
+    task, controller = batch([UR5, PLANE], 4, task=["reach", "push"]), ScriptedPush(0)
     task.reset()
     moved = torch.zeros(4, dtype=torch.bool)
     for _ in range(60):
@@ -402,11 +400,10 @@ def test_actions_are_in_range_and_reach_robots_do_not_move(tmp_path):
         assert actions.abs().max() <= 1
         moved |= actions.abs().amax(dim=1) > 0
         task.step(actions)
-    task.close()
     assert moved.tolist() == [False, True, False, True]
 
 
-def test_a_block_that_slips_away_is_replanned(tmp_path, monkeypatch):
+def test_a_block_that_slips_away_is_replanned(batch, monkeypatch):
     made = []
     plan = PushPlanner.plan
 
@@ -415,7 +412,7 @@ def test_a_block_that_slips_away_is_replanned(tmp_path, monkeypatch):
         return plan(self, pushes)
 
     monkeypatch.setattr(PushPlanner, "plan", counted)
-    task, controller = batch([PLANE], 1, tmp_path, sim="mujoco"), ScriptedPush(0)
+    task, controller = batch([PLANE], 1), ScriptedPush(0)
     task.reset()
     for i in range(PUSH.max_episode_steps):
         if i % 60 == 59:
@@ -426,7 +423,6 @@ def test_a_block_that_slips_away_is_replanned(tmp_path, monkeypatch):
             task.targets[:] = task.q
         if task.step(controller.act(task)).terminated.any():
             break
-    task.close()
     assert 2 <= len(made) <= pushing.MAX_PLANS
     assert not np.allclose(made[0].block, made[1].block)
     left = [push.steps_left for push in made]
@@ -436,13 +432,13 @@ def test_a_block_that_slips_away_is_replanned(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("free", [True, False])
-def test_a_tool_rises_when_its_arm_collides(free, tmp_path, monkeypatch):
+def test_a_tool_rises_when_its_arm_collides(free, batch, monkeypatch):
     def said(self, q):
         assert q.ndim == 2
         return np.full(len(q), free)
 
     monkeypatch.setattr(PushPlanner, "free", said)
-    task, controller = batch([PLANE], 1, tmp_path, sim="mujoco"), ScriptedPush(0)
+    task, controller = batch([PLANE], 1), ScriptedPush(0)
     task.reset()
     heights = []
     while len(heights) < 12:
@@ -452,7 +448,6 @@ def test_a_tool_rises_when_its_arm_collides(free, tmp_path, monkeypatch):
             tools = frame_positions(task.robot_tables.tool_chain, robots, targets)
             heights.append(float(tools[0, 2]))
         assert not task.step(acting).terminated.any()
-    task.close()
     rise = 0.0 if free else pushing.RISE
     assert np.diff(heights[1:]) == pytest.approx(rise, abs=pushing.RISE / 3)
 
@@ -524,12 +519,12 @@ def test_episodes_succeed_and_other_tasks_stand_still(recorded):
         ("drawer", "cylinder-000003"),
     ],
 )
-def test_gantries_with_large_and_thin_tools_succeed(task, name):
+def test_gantries_with_large_and_thin_tools_succeed(task, name, opened):
     members = read_split(f"composition/ee-arm/{task}").side("train")
     member = next(member for member in members if member.name == name)
     spec = member_spec(member, default_library(), GoalConfig())
-    with closing(batch_from_specs([spec], EPISODES, layouts="eval")) as task_batch:
-        assert all(episode.success for episode in run_episodes(task_batch, Scripted(0), 1))
+    task_batch = opened(batch_from_specs([spec], EPISODES, layouts="eval"))
+    assert all(episode.success for episode in run_episodes(task_batch, Scripted(0), 1))
 
 
 @pytest.mark.slow

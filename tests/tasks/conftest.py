@@ -1,6 +1,5 @@
 """Fixtures shared by the task tests."""
 
-from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,13 +23,6 @@ def named_once():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("morphgen.tasks.scenes.make.load_robot", load)
         yield
-
-
-@pytest.fixture
-def opened():
-    """Return a function that returns what it is given, which is closed after the test."""
-    with ExitStack() as stack:
-        yield lambda thing: stack.enter_context(closing(thing))
 
 
 @pytest.fixture
