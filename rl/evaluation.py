@@ -55,8 +55,7 @@ class EvalConfig:
     episodes: int = 34  # minimum number of complete episodes per robot
     sim: str = DEFAULT_SIMULATOR  # name of the simulator
     seed: int = 0  # seed of the episodes
-    workers: int | None = None
-    """Number of MuJoCo threads; scores do not depend on it."""
+    workers: int | None = None  # number of MuJoCo threads; scores do not depend on it
     tasks: tuple[TaskConfig, ...] = field(default_factory=default_configs)
     """Configs of tasks; other tasks have their defaults."""
 

@@ -36,8 +36,7 @@ from morphgen.rl.runs.checkpoint import RunConfig
 from morphgen.rl.runs.robot_source import RecordedSource, num_actuated
 from morphgen.tasks.batch import TaskBatch
 
-CHUNK = 4096
-"""Steps whose observations are computed at once."""
+CHUNK = 4096  # steps whose observations are computed at once
 MAX_GIB = 24
 """Most memory that the observations of all steps may take [GiB]; they are computed once."""
 

@@ -50,15 +50,12 @@ class RecordedEpisode:
     robot_hash: str
     task: str
     policy: str
-    seed: int
-    """Seed of the environment whose first episode it is; see ``TaskBatch.reset``."""
+    seed: int  # seed of the environment whose first episode it is; see `TaskBatch.reset`
     success: bool
     score: float
     distance: float
-    first: int
-    """Index of its first step."""
-    length: int
-    """Number of its steps."""
+    first: int  # index of its first step
+    length: int  # number of its steps
 
     @property
     def frames(self) -> range:

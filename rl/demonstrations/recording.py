@@ -89,29 +89,21 @@ def best_of(task: str, policy: str) -> str:
 class RecordingConfig:
     """All that determines the episodes of a data set."""
 
-    sources: tuple[Source, ...]
-    """Robots with their tasks; those of a split have a task each."""
-    policy: str = PLANNER
-    """A baseline, a shipped policy, a checkpoint, or ``PLANNER``."""
+    sources: tuple[Source, ...]  # robots with their tasks; those of a split have a task each
+    policy: str = PLANNER  # a baseline, a shipped policy, a checkpoint, or `PLANNER`
     teacher: str = ""
     """Policy whose actions are the labels, in the states that ``policy`` leads to; empty for those
     of ``policy``. See ``record_states``."""
-    episodes: int = 20
-    """Number of episodes of each robot at each of its tasks."""
-    seed: int = 0
-    """Seed of the episodes, of the policy and of the noise."""
-    noise: float = 0.0
-    """Standard deviation of the noise on normalized actions; labels have none."""
+    episodes: int = 20  # number of episodes of each robot at each of its tasks
+    seed: int = 0  # seed of the episodes, of the policy and of the noise
+    noise: float = 0.0  # standard deviation of the noise on normalized actions; labels have none
     hold: int = 25
     """Control steps in success, one after another, that end an episode: reach has no other end
     before its time limit, and a robot that stays at its goal shows little more."""
-    only_success: bool = False
-    """Whether to keep only the episodes that end in success."""
+    only_success: bool = False  # whether to keep only the episodes that end in success
     sim: str = DEFAULT_SIMULATOR
-    cameras: tuple[Camera, ...] = ()
-    """Cameras whose videos are added, ``front`` and ``wrist``."""
-    depth: bool = False
-    """Whether cameras also have depths."""
+    cameras: tuple[Camera, ...] = ()  # cameras whose videos are added, `front` and `wrist`
+    depth: bool = False  # whether cameras also have depths
     goals: GoalConfig = field(default_factory=GoalConfig)
 
     def as_data(self, tasks: Sequence[str]) -> dict[str, Any]:
@@ -482,18 +474,12 @@ class Replay:
     """A recorded episode beside the same one in the simulator."""
 
     episode: RecordedEpisode
-    robot: str
-    """Name of the robot."""
-    joint_error: float
-    """Largest difference of a joint's position in any step [rad or m]."""
-    object_error: float
-    """Largest difference of the object's position in any step [m]."""
-    reward_error: float
-    """Largest difference of a reward."""
-    success: bool
-    """Whether the simulated episode ended in success."""
-    faults: tuple[str, ...]
-    """Faults of the certificates of its goals."""
+    robot: str  # name of the robot
+    joint_error: float  # largest difference of a joint's position in any step [rad or m]
+    object_error: float  # largest difference of the object's position in any step [m]
+    reward_error: float  # largest difference of a reward
+    success: bool  # whether the simulated episode ended in success
+    faults: tuple[str, ...]  # faults of the certificates of its goals
 
     @property
     def agrees(self) -> bool:

@@ -90,8 +90,7 @@ class OneRobot(_Robots):
 class GrammarSource(_Robots):
     """Robots that ``draw`` draws from grammars; with several tasks they have them in turn."""
 
-    task: str
-    """Name of the task, or names with commas between them."""
+    task: str  # name of the task, or names with commas between them
     obstacles: bool = False
     grammars: tuple[tuple[str, int], ...]
     """Grammars, by name or path, and the number of robots to draw from each."""
@@ -105,13 +104,10 @@ class GrammarSource(_Robots):
 class RecordedSource(_Robots):
     """Robots of demonstrations, which a policy learns from without an environment."""
 
-    task: str
-    """Name of the task, or names with commas between them."""
+    task: str  # name of the task, or names with commas between them
     obstacles: bool = False
-    demonstrations: tuple[str, ...]
-    """Folders of the data sets."""
-    content: tuple[str, ...]
-    """Hash of the steps of each data set."""
+    demonstrations: tuple[str, ...]  # folders of the data sets
+    content: tuple[str, ...]  # hash of the steps of each data set
 
 
 Source: TypeAlias = SplitSource | OneRobot | GrammarSource | RecordedSource
