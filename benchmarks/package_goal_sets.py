@@ -25,13 +25,13 @@ from morphgen.processes import parallel_map
 from morphgen.progress import show_progress
 from morphgen.splits.split import Member, read_split, sided_members, split_names
 from morphgen.tasks.goal_sets import FOLDER, INDEX, packaged_index, set_npz
-from morphgen.tasks.registry import TASKS
 from morphgen.tasks.scenes.env_specs import GoalConfig, env_spec, member_with_primitives
 from morphgen.tasks.split_goals import certify_goal_set
 
 Identity = tuple[str, str, bool]
 """Hash of a robot in splits, its task, and whether there are obstacles."""
 
+_CERTIFICATES = ("behind", "across", "distance", "path")  # of starts, found by inverse kinematics
 _ROUNDING = {4: 1e-6, 8: 1e-12}
 """Largest difference of certificates on two processors by bytes of a number [m or rad]."""
 
@@ -60,7 +60,7 @@ def write_sets(folder: Path = FOLDER, jobs: int = 1) -> None:
     ):
         file = f"{key[:16]}.npz.xz"
         compressed = lzma.compress(content, preset=9)
-        if not _has(folder / file, content, member.task):
+        if not _has(folder / file, content):
             folder.mkdir(parents=True, exist_ok=True)
             (folder / file).write_bytes(compressed)
         stored = (folder / file).read_bytes()
@@ -79,14 +79,12 @@ def write_sets(folder: Path = FOLDER, jobs: int = 1) -> None:
     write_atomic(folder / INDEX, f"{{\n{lines}\n}}\n")
 
 
-def _has(path: Path, content: bytes, task: str) -> bool:
+def _has(path: Path, content: bytes) -> bool:
     """Return whether a file has this set, whatever version of xz compressed it."""
-    return path.is_file() and not set_differences(
-        lzma.decompress(path.read_bytes()), content, TASKS[task].goal_set_type.not_compared
-    )
+    return path.is_file() and not set_differences(lzma.decompress(path.read_bytes()), content)
 
 
-def set_differences(npz: bytes, other: bytes, certificates: frozenset[str]) -> list[str]:
+def set_differences(npz: bytes, other: bytes) -> list[str]:
     """Return the arrays in which two sets differ, certificates by more than rounding.
 
     Processors round the products of inverse kinematics, which found the certificates, apart.
@@ -99,7 +97,7 @@ def set_differences(npz: bytes, other: bytes, certificates: frozenset[str]) -> l
         for name in a.files
         if a[name].tobytes() != b[name].tobytes()
         and not (
-            name in certificates
+            name in _CERTIFICATES
             and a[name].dtype == b[name].dtype
             and a[name].dtype.kind == "f"
             and a[name].shape == b[name].shape

@@ -169,8 +169,6 @@ class GoalSet:
     """
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
-    not_compared: ClassVar[frozenset[str]]
-    """Fields that are certified, but not compared with those of a set sampled anew."""
     robot: str
     """Name of the robot."""
     key: str

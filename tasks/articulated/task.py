@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,8 +67,6 @@ _PLACED = 1e-6  # largest height of an object above the ground [m]
 @dataclass(frozen=True, eq=False)
 class ArticulatedStartSet(GoalSet):
     """Starts of a robot's episodes with an articulated object, which stands at one place."""
-
-    not_compared: ClassVar[frozenset[str]] = frozenset(("robot", "distance", "path"))
 
     robot: str
     key: str

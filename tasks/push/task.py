@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -336,8 +336,6 @@ class PushStartSet(GoalSet):
 
     See ``GoalSet`` for the fields that all tasks have.
     """
-
-    not_compared: ClassVar[frozenset[str]] = frozenset(("robot", "behind", "across"))
 
     robot: str
     key: str

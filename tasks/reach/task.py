@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +43,6 @@ EXACT = 1e-6
 @dataclass(frozen=True, eq=False)
 class ReachGoalSet(GoalSet):
     """Goals of a robot, which are also its starts, and its obstacles; see ``GoalSet``."""
-
-    not_compared: ClassVar[frozenset[str]] = frozenset(("robot",))
 
     robot: str
     key: str
