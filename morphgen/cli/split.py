@@ -225,9 +225,6 @@ def _summary(split: Split, path: Path) -> list[str]:
         f"{path}: {split.summary}",
         f"  test: {', '.join(member.name for member in split.test)}",
     ]
-    repeated = len(split.train) - len({(member.robot_hash, member.task) for member in split.train})
-    if repeated:
-        lines.append(f"  {repeated} train robots have the body and task of an earlier one")
     if isinstance(left_out := split.provenance.get("left_out"), Mapping):
         reasons = ", ".join(f"{count} with {reason}" for reason, count in left_out.items())
         lines.append(f"  robots that were left out: {reasons}")

@@ -122,17 +122,6 @@ def test_several_train_sizes_write_one_file_each(run, ok):
     assert Path("a-train2.yaml").is_file()
 
 
-def test_duplicate_train_robots_are_reported(run):
-    Path("two.grammar").write_text(
-        "robot -> gantry ee\nee -> @weight(30) plane(size=0.1) | plane(size=0.2)\n"
-    )
-    _, out, _ = run("split", "new", "interpolation", "--grammar", "two.grammar", "--train", 5)
-    split = read_split("interpolation-two-reach-seed0.yaml")
-    repeated = 5 - len({member.robot_hash for member in split.train})
-    assert repeated > 2
-    assert f"  {repeated} train robots have the body and task of an earlier one\n" in out
-
-
 def test_existing_split_file_is_never_replaced(run, refused):
     assert run(*INTERPOLATION, "--out", "a.yaml")[0] == 0
     message = refused(*INTERPOLATION, "--out", "a.yaml", "--seed", 1)
