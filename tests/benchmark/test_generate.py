@@ -17,7 +17,6 @@ from morphgen.benchmark.regimes import (
     hull_distance,
     interpolation,
     parameters,
-    parts,
     regime_findings,
     structure,
 )
@@ -253,13 +252,6 @@ def test_a_structure_has_parts_and_counts_but_no_sizes_and_labels():
     bare = parse_derivation("base=fixed[top: arm=ur5[flange: ee=tongs]]")
     assert structure(bare, LIBRARY) == structure(named, LIBRARY)  # omitted counts are defaults
     assert parameters(bare, LIBRARY) == parameters(named, LIBRARY)
-
-
-def test_parts_include_the_default_base():
-    assert parts(derivation("arm=ur5 ee=plane")) == {"fixed", "ur5", "plane"}
-    assert parts(derivation("arm=ur5")) == {"fixed", "ur5"}
-    two = derivation("base=pedestal left.arm=ur5 left.ee=plane right.arm=lwr")
-    assert parts(two) == {"pedestal", "ur5", "plane", "lwr"}
 
 
 def test_parameters_are_in_tree_order():

@@ -23,9 +23,7 @@ from morphgen.encoding.tokens import GEOMETRY, ORIGIN, PARENT, pad_tokens, token
 from morphgen.errors import BenchmarkError, FormatError, MorphgenError
 from morphgen.fitting.token_shapes import token_shapes
 from morphgen.formats import zip_files as npz_files
-from morphgen.grammar.compose import compose
 from morphgen.progress import show_progress
-from morphgen.splits import split as split_module
 from morphgen.splits.split import compose_member, read_split, split_id, split_text
 
 
@@ -538,13 +536,3 @@ def test_unreadable_folders_are_errors(bundles, path, content, message):
     put(bundles / path, content)
     with pytest.raises(MorphgenError, match=message):
         verify(bundles, LIBRARY)
-
-
-def test_each_robot_is_composed_once_to_verify(bundles, monkeypatch):
-    composed = []
-    monkeypatch.setattr(
-        split_module, "compose", lambda *words: composed.append(words[0]) or compose(*words)
-    )
-    assert verify(bundles, LIBRARY).differences == ()
-    members = split_module.sided_members(read_split(bundles / "split.yaml"))
-    assert len(composed) == len({member.derivation for _, member in members})

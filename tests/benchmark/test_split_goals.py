@@ -506,10 +506,3 @@ def test_damaged_files_are_refused(folder):
     path.unlink()
     with pytest.raises(TaskError, match=r"\.npz\.xz: No such file or directory; install"):
         env_spec(body, "reach")
-
-
-def test_sizes_are_those_of_the_files():
-    lines = script.sizes_text().splitlines()
-    assert len(lines) == 2 + len(split_names())
-    total = sum(path.stat().st_size for path in FOLDER.glob("*.xz"))
-    assert lines[-1].split()[-3:] == [str(len(MEMBERS)), f"{total / 1000:.0f}", "kB"]

@@ -132,21 +132,6 @@ def test_pairs_that_nearly_always_penetrate_are_ignored():
         assert ("fin", "wall") not in penetrations(robot, [robot.home])[0]
 
 
-def test_only_pairs_across_parts_are_tested():
-    robot = arm()
-    part = {"base": 0, "upper": 0, "lower": 0}
-    whole = survey_collisions(robot).ignore_pairs
-    inside = [pair for pair in whole if part.get(pair[0]) == part.get(pair[1])]
-    asked = []
-
-    def across(a, b):
-        asked.append((a, b))
-        return part.get(a) != part.get(b)
-
-    assert survey_collisions(robot, known_pairs=inside, should_test=across).ignore_pairs == whole
-    assert not set(asked) & set(whole)
-
-
 def test_known_pairs_are_sorted_and_have_links():
     known = survey_collisions(slides(0.0, 0.5), known_pairs=[("ball1", "ball0")])
     assert known.ignore_pairs == (("ball0", "ball1"),)

@@ -122,15 +122,6 @@ def test_the_line_of_a_terminal_is_removed_at_the_end(capsys, monkeypatch):
     assert err.count("\n") == 0
 
 
-def test_goal_sets_are_counted_until_all_are_ready(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "FIRST_LINE", -1.0)
-    with training_progress():
-        report(3, 10)
-        report(10, 10)
-    lines = [line for line in capsys.readouterr().err.splitlines() if "3 of 10 goal sets" in line]
-    assert len(lines) == 1
-
-
 def test_a_ctrl_c_that_an_import_lost_ends_the_next_progress(capsys):
     nothing = SimpleNamespace()
 

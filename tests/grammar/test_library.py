@@ -14,7 +14,6 @@ from morphgen.grammar import catalogue as module
 from morphgen.grammar.catalogue import FACTS_FILE, catalogue, compute_facts, source_digest
 from morphgen.grammar.compose import compose
 from morphgen.grammar.library import LIBRARY_VARIABLE, Library, default_library
-from morphgen.grammar.manifest import PART_KINDS
 from morphgen.grammar.part import load_part
 from morphgen.grammar.request import default_name, parse_request
 from morphgen.model.kinematics import forward_kinematics
@@ -69,13 +68,6 @@ def test_every_real_part_names_its_source_manufacturer_and_licence(name):
     assert re.fullmatch(r"[A-Za-z]+-[A-Za-z0-9.-]+|MIT|ISC", manifest.licence)
     assert len(manifest.citation) > 20
     assert manifest.summary
-
-
-def test_manifests_are_listed_by_kind():
-    kinds = [manifest.kind for manifest in LIBRARY.manifests()]
-    assert kinds == sorted(kinds, key=PART_KINDS.index)
-    assert set(kinds) == set(PART_KINDS)
-    assert len(kinds) == len(LIBRARY.names())
 
 
 @pytest.mark.parametrize(

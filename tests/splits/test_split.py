@@ -18,7 +18,7 @@ from morphgen.grammar.request import parse_words
 from morphgen.model.geometry import Box, Cylinder, Mesh, Pose, Shape
 from morphgen.model.robot import Frame, Inertial, Mimic
 from morphgen.model.tree import rename
-from morphgen.splits.split import Member, Split, compose_member, compose_side, split_id
+from morphgen.splits.split import Member, Split, compose_member, split_id
 
 LIBRARY = default_library()
 
@@ -162,12 +162,6 @@ def test_round_sizes_are_far_from_the_rounding_boundaries_of_the_hash(part):
         assert hashed(z - 5e-10) == hashed(z) == hashed(z + 5e-10)
 
 
-def test_a_composed_member_has_its_name():
-    robot = compose_member(member("arm=ur5 ee=plane", "mine"), LIBRARY)
-    assert (robot.name, len(robot.links)) == ("mine", 10)
-    assert robot.ignore_pairs
-
-
 def test_a_robot_with_another_hash_is_an_error():
     changed = replace(member("base=gantry ee=plane"), robot_hash="0" * 32)
     composed_hash = member("base=gantry ee=plane").robot_hash
@@ -180,17 +174,6 @@ def test_a_member_that_cannot_be_composed_is_an_error_with_the_reason():
         compose_member(replace(member("base=gantry ee=plane"), derivation="base=plnae"), LIBRARY)
     with pytest.raises(GrammarError, match=r"derivation of 'mine'.*invalid derivation"):
         compose_member(replace(member("base=gantry ee=plane", "mine"), derivation="base"), LIBRARY)
-
-
-def test_robots_are_composed_lazily():
-    good = member("base=gantry ee=plane")
-    broken = replace(member("base=gantry ee=cube"), robot_hash="0" * 32)
-    split = Split("s", "composition", "", (good, broken), (good,))
-    train = compose_side(split, "train", LIBRARY)
-    assert next(train).name == "gantry-plane"
-    with pytest.raises(BenchmarkError):
-        next(train)
-    assert [robot.name for robot in compose_side(split, "test", LIBRARY)] == ["gantry-plane"]
 
 
 def split_of_two():

@@ -106,12 +106,6 @@ def test_changing_the_base_keeps_limbs_with_matching_ports():
     assert changed(words, "base", "planar") == words.replace("pedestal", "planar")
 
 
-def test_a_value_is_replaced_and_the_default_is_left_out():
-    words = "base=fixed arm=arm3 arm.length=0.2"
-    assert changed(words, "arm.length", "") == "base=fixed arm=arm3"
-    assert changed(words, "arm.length", "0.4") == "base=fixed arm=arm3 arm.length=0.4"
-
-
 @pytest.mark.parametrize("words", [WORDS, "base=planar ee=cube", "arm=arm3 ee=claw ee.mount_yaw=1"])
 def test_a_derivation_of_words_is_edited_by_its_parts(words):
     derivation, _ = parse_words(words.split(), LIBRARY)
@@ -124,12 +118,6 @@ def test_a_derivation_of_words_is_edited_by_its_parts(words):
 )
 def test_a_derivation_of_another_shape_has_no_words(text):
     assert pages.words_of(parse_derivation(text), LIBRARY) is None
-
-
-def test_parameters_of_any_derivation_can_be_changed():
-    derivation = parse_derivation("post=post(height=0.05)[top: beam1=beam(length=0.2)]")
-    changed = pages.with_parameter(derivation, "beam1", "length", 0.3)
-    assert str(changed) == "post=post(height=0.05)[top: beam1=beam(length=0.3)]"
 
 
 def test_a_derivation_has_a_slider_for_each_of_its_values(shared_viewer):

@@ -14,11 +14,9 @@ from morphgen.errors import BenchmarkError
 from morphgen.grammar.compose import compose
 from morphgen.grammar.library import default_library
 from morphgen.grammar.request import parse_words
-from morphgen.model.geometry import Capsule, Shape
 from morphgen.model.inertia import fit_camera
 from morphgen.model.kinematics import forward_kinematics, joint_limits
 from morphgen.model.mesh import load_mesh
-from morphgen.model.robot import Link, Robot
 from morphgen.splits.split import find_split, read_split
 from morphgen.viewer.app.address import AddressError
 from morphgen.viewer.pages import population as population_page
@@ -183,14 +181,6 @@ def test_poses_of_all_robots_equal_those_of_each(population):
         mine = instances.robot == i
         expected = T_root_link[instances.link[mine]] @ instances.T_link_shape[mine]
         np.testing.assert_allclose(poses[mine], expected, atol=1e-5)
-
-
-def test_a_capsule_is_a_cylinder_and_two_balls():
-    robot = Robot("pill", (Link("root", visuals=(Shape(Capsule(0.1, 0.4)),)),))
-    pill = make_population([ReadRobot(Row("pill", "pill"), robot, np.zeros((2, 3)))])
-    assert len(pill.instances.robot) == 3
-    heights = sorted(shape_poses(pill, pill.home)[:, 2, 3])
-    np.testing.assert_allclose(heights, (-0.2, 0.0, 0.2), atol=1e-6)
 
 
 def test_large_meshes_are_simplified_although_their_arrays_are_read_only():

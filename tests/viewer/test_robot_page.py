@@ -141,12 +141,6 @@ def test_a_robot_passes_with_each_of_its_licences():
     assert [passes(row, {"licence": each}) for each in ("MIT", "Apache-2.0", "BSD")] == [1, 1, 0]
 
 
-def test_known_facts_are_joined_in_one_line():
-    row = Row("d", "d", dof=3, reach=0.5, mass=1.25, findings=())
-    assert robot_rows.facts_line(row) == "3 DoF · 0.50 m · 1.25 kg"
-    assert robot_rows.facts_line(Row("d", "d")) == ""
-
-
 def test_licences_of_parts_are_shown_with_their_restrictions():
     assert markup.licence_line(arm()) == ""
     parts = [{"licence": each} for each in ("MIT", "CC-BY-NC-SA-4.0", "MIT")]
@@ -165,13 +159,6 @@ def test_joints_are_grouped_by_their_part():
     parts = [{"label": "arm", "part": "x"}, {"label": "ee", "part": "y"}]
     named = replace(robot, joints=renamed, home=(0,) * 5, provenance={"parts": parts})
     assert joint_groups(named) == [("arm", "arm (x)", [0, 1, 2]), ("ee", "ee (y)", [3, 4])]
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "step"), [(-3.14, 3.14, 0.01), (0, 0.04, 0.0001), (0, 0, 0.001), (-1, 1, 0.01)]
-)
-def test_slider_steps_are_round_and_small(low, high, step):
-    assert markup.slider_step(low, high) == pytest.approx(step)
 
 
 def test_tables_name_every_link_and_escape_it():
