@@ -331,7 +331,7 @@ def _cloning_config(
 ) -> RunConfig:
     source, steps = recorded_source(data), sum(map(len, data))
     words = {"steps": max(round(given.epochs * steps), given.minibatch), "envs": given.minibatch}
-    words |= {"sim": data[0].settings["sim"], "geometry": "primitive", "whole": False, "goal": None}
+    words |= {"sim": data[0].settings["sim"], "whole": False, "goal": None}
     words |= {"bf16": False, "compile": False, "train_goals": None}
     links = default_max_links(len(robot.links) for each in data for robot in each.robots)
     options = SimpleNamespace(**vars(given) | words | {"max_links": links})

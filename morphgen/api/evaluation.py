@@ -226,10 +226,7 @@ def _plan_submission(
     config: EvalConfig,
     **facts: Any,  # noqa: ANN401
 ) -> Callable[[Iterable[Score]], None]:
-    """Return the function that writes the episodes of scores as a submission.
-
-    Unless one is asked for it does nothing. ``facts`` are arguments of ``make_submission``.
-    """
+    """Return the function that writes scores as a submission with facts, if one is asked for."""
     if given.submission is None:
         return lambda scores: None
     path = path_argument("submission", given.submission, TaskError)

@@ -422,11 +422,7 @@ def _choose(
 
 
 def _several(key: str, names: Names) -> tuple[str, ...]:
-    """Return the names of an argument.
-
-    Raises:
-        BenchmarkError: If it is neither a text nor several.
-    """
+    """Return the names of an argument, which is one text or several."""
     several = (names,) if isinstance(names, str) or not isinstance(names, Iterable) else names
     texts = tuple(several)
     if not all(isinstance(text, str) for text in texts):

@@ -331,12 +331,7 @@ def read_constants(constants: Mapping[str, float] | Sequence[str]) -> dict[str, 
 
 
 def _max_links(source: robot_source.Source) -> int:
-    """Return the number of links that observations are padded to by default.
-
-    For a split it is the split's number. For drawn robots, of which the largest is not known yet,
-    it is the benchmark's. For one robot it is the benchmark's, or the number of the
-    robot's links if these are more, as for a robot with two arms.
-    """
+    """Return the split's number of links; else the benchmark's, or more for one larger robot."""
     if isinstance(source, robot_source.SplitSource):
         return robot_source.split_of(source).max_links
     if isinstance(source, robot_source.GrammarSource):

@@ -400,10 +400,7 @@ def _drawn_splits(
     advice: str,
     jobs: int,
 ) -> tuple[Split, ...]:
-    """Return splits of robots that are taken from streams of train and test robots in turn.
-
-    advice: What to change if a search finds too few robots.
-    """
+    """Return splits of robots from streams in turn; errors give advice on what to change."""
     train_streams, test_streams = streams
     turns = (divmod(i, len(train_streams)) for i in range(request.train[-1]))
     recipes = [train_streams[stream].recipe(number) for number, stream in turns]

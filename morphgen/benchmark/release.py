@@ -323,10 +323,7 @@ class ReleaseReport:
 def check_release(
     split: Split, library: Library, request: ReleaseRequest, *, jobs: int = 1
 ) -> tuple[Release, tuple[licences.LicencedPart, ...]]:
-    """Require that a split may be released: names, licences of its parts, and audit.
-
-    Return the description of the release and the parts of the robots.
-    """
+    """Require sound names, licences and audit; return the release's description and the parts."""
     parts = licences.licenced_parts(split, library)
     licences.require_allowed(split, parts, request.allowed_licences)
     release = _release(split, request)

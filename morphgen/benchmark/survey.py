@@ -212,10 +212,7 @@ MEASURED = ("mass", "reach")
 
 
 def statistics(split: Split, library: Library, *, jobs: int = 1) -> dict[str, object]:
-    """Compute sizes of the robots of a split, and the similarity of test and train robots.
-
-    The files of the splits that come with morphgen contain them.
-    """
+    """Compute sizes of a split's robots and the similarity of its sides, as shipped files have."""
     survey = survey_split(split, library, jobs=jobs)
     return {
         **{side: _side(survey, side) for side in SIDES},

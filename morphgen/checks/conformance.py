@@ -331,10 +331,7 @@ def _mimic_differences(
 
 
 def _follow(name: str, mimics: Mapping[str, Mimic], independent: set[str]) -> Mimic:
-    """Return a joint's coupling to the independent joint at the end of its chain of leaders.
-
-    A fixed joint at the end stays at zero: its name is empty and only the offset counts.
-    """
+    """Return a joint's coupling to the independent joint that it follows; of none, the offset."""
     joint, multiplier, offset = name, 1.0, 0.0
     for _ in range(len(mimics)):
         if joint not in mimics:

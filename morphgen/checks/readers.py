@@ -268,10 +268,7 @@ def read_pinocchio(folder: Path, frame: str, q: Mapping[str, Array], n: int) -> 
 
 
 def _pinocchio_mimics(urdf: Path) -> dict[str, Mimic] | None:
-    """Return the mimic joints; None if Pinocchio has no model of them.
-
-    It refuses those that follow another mimic joint or a continuous one.
-    """
+    """Return the mimic joints; None if one follows a mimic or continuous one: it is refused."""
     try:
         model = _pinocchio_model(urdf, mimic=True)
     except FormatError:

@@ -142,10 +142,7 @@ def _gyration_radii(inertial: Inertial) -> Array:
 
 
 def _unit_density_inertial(link: Link) -> Inertial | None:
-    """Return the mass properties of a link's solid shapes at 1 kg/m^3, else of its visual ones.
-
-    Return None if there are no shapes, if one is invalid, or if all are flat.
-    """
+    """Return the mass properties of a link's shapes at 1 kg/m^3; None if none has a volume."""
     shapes = link.solid_shapes
     if not shapes or not all(has_hull(shape.geometry) for shape in shapes):
         return None

@@ -40,10 +40,7 @@ class Entry:
 
 
 def diagnose() -> Iterator[tuple[str, Entry]]:
-    """Examine the installation; yield each result with its section as soon as it is known.
-
-    An error of a broken package is a result, too.
-    """
+    """Examine the installation; yield each result with its section as soon as it is known."""
     for name, examine in (
         ("morphgen", _morphgen),
         ("python", _python),

@@ -38,11 +38,7 @@ class Chooser:
 
 
 class RandomChooser(Chooser):
-    """Draws every choice from a random generator.
-
-    Attributes:
-        choices: All choices made so far, as a file would hold them.
-    """
+    """Draws every choice from a random generator, and keeps them as a file would hold them."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng

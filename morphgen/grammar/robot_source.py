@@ -255,11 +255,7 @@ def _has_tool_link(robot: Robot) -> bool:
 
 
 def _with_tool(robot: Robot, link: str) -> Robot:
-    """Return the robot with the frame of a link as its frame ``tool``.
-
-    A link ``tool`` becomes ``tool_link``, or the like: a bundle's URDF has a link for the frame
-    itself, and a joint ``tool_joint``.
-    """
+    """Return the robot with a link's frame as ``tool``; a link of that name gets another one."""
     links = {TOOL: _free(f"{TOOL}_link", robot.link_index)} if TOOL in robot.link_index else {}
     joint, new_joint = f"{TOOL}_joint", _free(f"{TOOL}_link_joint", robot.joint_index)
     robot = rename(robot, links, {joint: new_joint} if joint in robot.joint_index else {})

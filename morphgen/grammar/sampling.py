@@ -336,11 +336,7 @@ def _require_same_grammar(config: SetConfig) -> None:
 
 
 def _finished(config: SetConfig) -> dict[int, bytes]:
-    """Return the line of the record of each finished robot, by index.
-
-    A line cut short by an interruption is ignored. Partial folders of interrupted robots are
-    deleted.
-    """
+    """Return the records' lines of finished robots by index; delete folders that are partial."""
     finished = {}
     for path in (config.folder / INDEX, config.folder / JOURNAL):
         if path.is_file():

@@ -325,10 +325,7 @@ def save_split(
 def add_split_form(
     session: Session, choose_sides: Callable[[], tuple[list[Row], list[Row]]]
 ) -> None:
-    """Add controls that save a new split for a task, and show the command that audits it.
-
-    The function returns the robots to train on and those to test on.
-    """
+    """Add controls that save a new split of two sides, and show the command that audits it."""
     gui = session.client.gui
     with gui.add_folder("New split"):
         name = gui.add_text("split name", "")
