@@ -68,6 +68,10 @@ class StepResult(Generic[A]):
     angle: A | None = None
     """Angle from success, shape (k,) [rad]; None if the task wants no orientation."""
 
+    def __post_init__(self) -> None:
+        if not self.terms:
+            raise TaskError("a StepResult without terms: expected at least one reward term")
+
 
 class StepFormulas(ABC, Generic[A]):
     """The formulas of a task's step, for tensors of k environments and for NumPy arrays alike.

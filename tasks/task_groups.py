@@ -47,8 +47,6 @@ class _Group:
         result = self.envs.formulas.evaluate(state)
         for name in _RESULTS:
             self._require(f"evaluate: {name}", getattr(result, name))
-        if not result.terms:
-            raise TaskError(f"task {self.task.name!r}: evaluate: expected at least one reward term")
         for name, value in result.terms.items():
             self._require(f"evaluate: the reward term {name!r}", value)
         return result

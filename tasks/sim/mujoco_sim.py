@@ -224,7 +224,7 @@ class MujocoSimulation(HostSimulation):
         self._worlds = worlds(self.scenes, contacts or Contacts())
         self._data = [mujoco.MjData(world.model) for world in self._worlds]
         self._controls = np.zeros(self._targets.shape)
-        self._helpers = threads - 1
+        self._helpers = min(threads, len(scenes)) - 1
         self._state = MujocoState(self._worlds, self._data)
         self.q, self.qd = self._state.q, self._state.qd
         self.object_pose = self._state.object_pose

@@ -128,6 +128,8 @@ def test_reach_reward_terms():
     assert terms["joint_limits"].tolist() == pytest.approx([-0.5, -0.5])
     assert terms["joint_acceleration"].tolist() == pytest.approx([-1e-4, 0.0])
     assert result.score.tolist() == pytest.approx([200.0, -50 * 0.031**2])
+    with pytest.raises(TaskError, match="without terms: expected at least one reward term"):
+        replace(result, terms={})
 
 
 def test_push_reward_terms():
@@ -360,7 +362,6 @@ def test_a_sound_task_is_stepped(make):
             {"begin": lambda *_: (torch.zeros(2, 1), torch.zeros(2, 7))},
             r"begin: the joint positions has shape \(2, 1\); expected \(2, 5\)",
         ),
-        (changed(terms=lambda terms: {}), "evaluate: expected at least one reward term"),
         (
             changed(terms=lambda terms: {"a": next(iter(terms.values())).mean()}),
             r"evaluate: the reward term 'a' has shape \(\); expected \(2,\)",

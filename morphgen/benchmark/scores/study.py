@@ -436,10 +436,7 @@ def replay_submission(
             if all(each.agrees for each in found):
                 yield from found
                 continue
-            note(
-                f"morphgen: {where}: episodes of {side} robots end otherwise alone, where numbers "
-                "are rounded otherwise; running the whole evaluation"
-            )
+            note(f"morphgen: {where}: episodes end otherwise alone; running the whole evaluation")
         outcomes = {score.robot: score.outcomes for score in run_whole(of_side)} if own else {}
         for robot, number in own:
             whole = outcomes[robot.robot]
