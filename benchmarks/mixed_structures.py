@@ -9,7 +9,8 @@ environments. The columns:
 - morphgen: the simulation of ``morphgen train --sim warp``, with its control law and states. Robots
   of one structure share kernels, and structures are branches of one CUDA graph.
 - union: MuJoCo Warp with one model of an arm of each structure, of which all but one sleep in every
-  environment, without control law and states. A block is that of all arms.
+  environment, without control law and states. A block is that of all arms. If worlds lose contacts,
+  they get twice the memory, and the measurement is repeated.
 - Kamino: the solver of Newton for any mixture of models, likewise, if the package newton is
   installed, with ``--kamino-envs`` environments.
 
@@ -38,7 +39,13 @@ from tabulate import tabulate
 import morphgen
 from morphgen.tasks.sim.base import SUBSTEPS, TIMESTEP, Block, Contacts, Scene
 from morphgen.tasks.sim.mujoco_model import _robot_spec, _world, worlds
-from morphgen.tasks.sim.warp_sim import CONTACTS_PER_WORLD, WarpSimulation, max_contacts, structures
+from morphgen.tasks.sim.warp_sim import (
+    CONTACTS_PER_WORLD,
+    IGNORED_OVERFLOW,
+    WarpSimulation,
+    max_contacts,
+    structures,
+)
 
 STEPS, WARM_UP, TARGETS = 60, 10, 20
 """Measured control steps, those before, and number of different targets."""
@@ -149,21 +156,28 @@ def _union(kinds: Sequence[Scene], shares: Sequence[int], envs: int, device: str
     model = union.compile()
     number = np.array(shares) * envs // sum(shares)
     number[0] += envs - number.sum()
-    with wp.ScopedDevice(device):
-        ours = mujoco_warp.put_model(model)
-        data = mujoco_warp.make_data(
-            model, nworld=envs, naconmax=envs * CONTACTS_PER_WORLD, njmax=_union_rows(model, kinds)
+    states = np.tile(np.arange(model.ntree, dtype=np.int32), (envs, 1))  # each sleeps alone
+    active = np.repeat([_tree(model, i, scene) for i, scene in enumerate(kinds)], number)
+    states[np.arange(envs), active] = states[:, -1] = AWAKE
+    force = np.zeros((envs, model.nv), dtype=np.float32)
+    force[model.dof_treeid[None, :] == active[:, None]] = 0.1
+    rows, contacts = _union_rows(model, kinds), envs * CONTACTS_PER_WORLD
+    while True:
+        with wp.ScopedDevice(device):
+            ours = mujoco_warp.put_model(model)
+            ours.opt.warn_overflow = 0  # counted below
+            data = mujoco_warp.make_data(model, nworld=envs, naconmax=contacts, njmax=rows)
+            data.tree_asleep.assign(states)
+            data.qfrc_applied.assign(force)
+        step = _captured(
+            lambda ours=ours, data=data: mujoco_warp.step(ours, data), SUBSTEPS, device
         )
-        states = np.tile(np.arange(model.ntree, dtype=np.int32), (envs, 1))  # each sleeps alone
-        active = np.repeat([_tree(model, i, scene) for i, scene in enumerate(kinds)], number)
-        states[np.arange(envs), active] = states[:, -1] = AWAKE
-        data.tree_asleep.assign(states)
-        force = np.zeros((envs, model.nv), dtype=np.float32)
-        force[model.dof_treeid[None, :] == active[:, None]] = 0.1
-        data.qfrc_applied.assign(force)
-    return _steps_per_second(
-        _captured(lambda: mujoco_warp.step(ours, data), SUBSTEPS, device), envs
-    )
+        speed = _steps_per_second(step, envs)
+        lost = np.count_nonzero(data.overflow.numpy() & ~IGNORED_OVERFLOW)
+        if not lost:
+            return speed
+        print(f"union: {lost} of {envs} worlds lost contacts", file=sys.stderr, flush=True)
+        rows, contacts = 2 * rows, 2 * contacts
 
 
 def _union_rows(model: mujoco.MjModel, kinds: Sequence[Scene]) -> int:
