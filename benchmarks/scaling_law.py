@@ -1,14 +1,17 @@
 """Success on unseen robots against the number of robots that a policy was trained on, with a law.
 
-    python benchmarks/scaling_law.py [--tasks push door pose] [--robots 1 3 10 30 100 300 1000]
-        [--seeds 0 1 2 3 4] [--jobs 4] [--runs runs/scaling-law] [--out results/scaling-law.json]
-        [--report]
+    python benchmarks/scaling_law.py [--tasks push door pose push_cloned push_short]
+        [--robots 1 3 10 30 100 300 1000] [--seeds 0 1 2 3 4] [--jobs 4] [--runs runs/scaling-law]
+        [--out results/scaling-law.json] [--report]
 
 Each policy is trained on robots that are drawn from the grammar ``serial``, none of which is in a
 split, on GPUs in MuJoCo Warp, or without contacts for poses. All policies of a task have the same
-number of simulated steps. A seed is that of the robots and of the training. The policies are judged
-in MuJoCo, all in the same episodes, on robots of three kinds, none of which they were trained on:
-other draws of ``serial``; draws of grammars with other structures; and ten real arms with a stick.
+number of simulated steps. Those of ``push_cloned`` learn, on the CPU, from the successes among 600
+episodes of the policy ``zero-shot-push`` with the drawn robots, and those of ``push_short`` by PPO
+from about as many steps as these episodes have. A seed is that of the robots and of the training.
+The policies are judged in MuJoCo, all in the same episodes, on robots of three kinds, none of which
+they were trained on: other draws of ``serial``; draws of grammars with other structures; and ten
+real arms with a stick.
 
 Cells, a task with a number of robots and a seed, are kept in ``--out`` as soon as they are judged.
 What is there is not done again, and a training that was stopped is resumed. ``--jobs`` cells are
@@ -81,6 +84,8 @@ class Task:
     steps: float
     """Simulated steps of a training."""
     options: tuple[str, ...]
+    episodes: int = 0
+    """Episodes that are recorded to be cloned, in place of a training by PPO."""
 
 
 _ON_GPU = ("--device", "cuda", "--compile", "--train-goals", "50", "--no-tensorboard")
@@ -90,6 +95,12 @@ _CONTACTS = (
 )
 TASKS = {
     "push": Task("push", 4e6, _CONTACTS),
+    "push_cloned": Task("push", 0, ("--agent", "me-graph+contact+pace"), episodes=600),
+    "push_short": Task(
+        "push",
+        6e4,
+        ("--observe", "contact,pace", "--train-goals", "50", "--no-tensorboard", "--envs", "30"),
+    ),
     "door": Task("door", 3e6, _CONTACTS),
     "pose": Task(
         "reach",
@@ -118,26 +129,38 @@ class Cell:
 
 def train(cell: Cell, runs: Path, gpu: int) -> Path:
     """Train the policy of a cell, unless that is done, and return its folder."""
-    run, task = runs / cell.name, TASKS[cell.task]
+    run = runs / cell.name
     if is_trained(run):
         return run
-    words = (
-        *("train", f"task={task.name}", "--robots", f"{GRAMMAR}:{cell.robots}"),
-        *("--robot-seed", str(cell.seed), "--seed", str(cell.seed), "--steps", str(task.steps)),
-        *(*task.options, "--resume", "--out", str(run)),
-    )
     run.mkdir(parents=True, exist_ok=True)
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     device = str(gpu) if visible is None else visible.split(",")[gpu]
     with (runs / f"{cell.name}.log").open("a") as log:
-        subprocess.run(
-            [sys.executable, "-m", "morphgen", *words],
-            check=True,
-            env={**os.environ, "CUDA_VISIBLE_DEVICES": device},
-            stdout=log,
-            stderr=subprocess.STDOUT,
-        )
+        for words in _commands(cell, run):
+            subprocess.run(
+                [sys.executable, "-m", "morphgen", *words],
+                check=True,
+                env={**os.environ, "CUDA_VISIBLE_DEVICES": device},
+                stdout=log,
+                stderr=subprocess.STDOUT,
+            )
     return run
+
+
+def _commands(cell: Cell, run: Path) -> list[list[str]]:
+    """Return the commands that train the policy of a cell; each goes on if it was stopped."""
+    task, robots = TASKS[cell.task], f"{GRAMMAR}:{cell.robots}"
+    seed, end = str(cell.seed), ["--resume", "--out", str(run)]
+    if not task.episodes:
+        steps = ["--robot-seed", seed, "--seed", seed, "--steps", str(task.steps)]
+        return [["train", f"task={task.name}", "--robots", robots, *steps, *task.options, *end]]
+    demonstrations = str(run.with_name(f"{run.name}-demos"))
+    recorded = ["--tasks", task.name, "--policy", f"zero-shot-{task.name}", "--only-success"]
+    number = ["--episodes", str(task.episodes // cell.robots), "--seed", seed]
+    return [
+        ["record", "--robots", robots, *recorded, *number, "--out", demonstrations],
+        ["clone", demonstrations, "--seed", seed, *task.options, *end],
+    ]
 
 
 @cache
