@@ -241,7 +241,7 @@ prims_env(num_envs=0) => 0 environments
 prims_env(num_envs=10**30) => at most 1,048,576 environments
 prims_env(num_envs=2, max_links=10**12) => expected 2 to 10000
 export("prims", "gltf") => unknown format 'gltf'; did you mean 'glb'
-export("prims", "stl") => unknown format 'stl'; valid: curobo, gif
+export("prims", "stl") => unknown format 'stl'; valid: 
 train("prims") => prims: no such file, and no split of this name
 train("prims task=reach", steps="9") => steps '9': expected a whole number, 1
 train("prims task=reach", sim="mujco") => did you mean 'mujoco'
