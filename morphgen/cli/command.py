@@ -407,7 +407,9 @@ def parse(parser: Parser, argv: Sequence[str] | None) -> argparse.Namespace:
     used = getattr(args, "parser", parser)
     unknown = next((word for word in rest if word.startswith("-")), None)
     if unknown is not None:
-        valid = (name for name in used._option_string_actions if name.startswith("--"))
+        valid = [name for name in used._option_string_actions if name.startswith("--")]
+        if unknown.partition("=")[0] in valid:
+            used.error(f"{unknown} stands before the command; expected after it")
         used.error(f"unknown option {unknown!r}{nearest(unknown, valid)}")
     if rest and not hasattr(args, "words"):
         used.error(f"unknown arguments: {' '.join(rest)}")

@@ -42,7 +42,7 @@ COLUMNS = {
 def fit(args: argparse.Namespace) -> None:
     """Fit, print the table and write a bundle."""
     if args.all == bool(args.words):
-        raise MorphgenError("name a part, a robot or a mesh file, or say --all")
+        raise MorphgenError("name a part, a robot or a mesh file, or say --all alone")
     options = FitOptions(**opt.given(args, (each.name for each in fields(FitOptions))))
     if args.all:
         parts = parts_without_fits(opt.library_of(args))

@@ -83,6 +83,8 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
         """
         require_pyarrow()
         self.folder = Path(path)
+        if not self.folder.is_dir():
+            raise FormatError(f"{self.folder}: no such folder")
         if not (self.folder / INFO).is_file():
             begun = (self.folder / RECORDING).is_file()
             why = "not finished: run morphgen record again" if begun else f"it has no {INFO}"
