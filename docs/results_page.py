@@ -95,7 +95,14 @@ sys.path.append(str(ROOT / "benchmarks"))
 CURVE = runpy.run_path(str(ROOT / "benchmarks/robot_curve.py"))
 CURVE_OPTIONS = CURVE["arguments"](["--report", "--out", str(ROOT / "results/robot-curve.json")])
 LAW = runpy.run_path(str(ROOT / "benchmarks/scaling_law.py"))
-LAW_NUMBERS, LAW_SEEDS = (1, 3, 10, 30, 100, 1000), (0, 1)
+LAW_SEEDS = (0, 1)
+LAW_NUMBERS = {
+    "push": (1, 10, 30, 100, 300, 1000),
+    "door": (1, 10, 30, 100, 300, 1000),
+    "pose": (1, 3, 10, 30, 100, 1000),
+    "push_cloned": (1, 3, 10, 30),
+    "push_short": (1, 3, 10, 30),
+}
 TRANSFER = runpy.run_path(str(ROOT / "benchmarks/similarity_transfer.py"))
 SHIPPED_ARMS = runpy.run_path(str(ROOT / "benchmarks/zero_shot_arms.py"))
 
@@ -395,7 +402,10 @@ def curve_table(name: str) -> str:
 def law_tables() -> str:
     """Return the tables of benchmarks/scaling_law.py."""
     cells = LAW["read_cells"](ROOT / "results/scaling-law.json")
-    return str(LAW["report"](cells, ["pose"], LAW_NUMBERS, LAW_SEEDS))
+    tables = [
+        LAW["report"](cells, [task], numbers, LAW_SEEDS) for task, numbers in LAW_NUMBERS.items()
+    ]
+    return "\n\n".join(tables)
 
 
 def write_tables(tables: Mapping[str, str], page: Path) -> str:
