@@ -25,6 +25,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -169,9 +170,7 @@ def _union(kinds: Sequence[Scene], shares: Sequence[int], envs: int, device: str
             data = mujoco_warp.make_data(model, nworld=envs, naconmax=contacts, njmax=rows)
             data.tree_asleep.assign(states)
             data.qfrc_applied.assign(force)
-        step = _captured(
-            lambda ours=ours, data=data: mujoco_warp.step(ours, data), SUBSTEPS, device
-        )
+        step = _captured(partial(mujoco_warp.step, ours, data), SUBSTEPS, device)
         speed = _steps_per_second(step, envs)
         lost = np.count_nonzero(data.overflow.numpy() & ~IGNORED_OVERFLOW)
         if not lost:
