@@ -205,10 +205,10 @@ class _DraftMaker:
 def _make_pool(maker: _DraftMaker, patterns: Sequence[str]) -> list[_Draft]:
     """Return every robot that may be drawn, each derivation once."""
     drafts: dict[str, _Draft] = {}
-    for recipe in (
-        recipe for pattern in patterns for recipe in pattern_robots(pattern, maker.library)
-    ):
-        drafts.setdefault(str(recipe.derivation), maker.draft(recipe))
+    for pattern in patterns:
+        for recipe in pattern_robots(pattern, maker.library):
+            if (text := str(recipe.derivation)) not in drafts:
+                drafts[text] = maker.draft(recipe)
     return list(drafts.values())
 
 
