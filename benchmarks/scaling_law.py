@@ -95,7 +95,9 @@ _CONTACTS = (
 )
 TASKS = {
     "push": Task("push", 4e6, _CONTACTS),
-    "push_cloned": Task("push", 0, ("--agent", "me-graph+contact+pace"), episodes=600),
+    "push_cloned": Task(
+        "push", 0, ("--agent", "me-graph+contact+pace", "--no-tensorboard"), episodes=600
+    ),
     "push_short": Task(
         "push",
         6e4,
