@@ -200,7 +200,9 @@ def _with_networks_of(
     if initial is None:
         return config
     if agent != ME_GRAPH.name:
-        raise TaskError(f"agent {agent}: the networks are those of {initial}")
+        raise TaskError(
+            f"agent {agent}: the networks are those of {initial}; leave out agent, preset, observe"
+        )
     file = one_checkpoint(initial)
     policy = read_checkpoint(file)[0].policy
     return replace(config, policy=policy, initial_checkpoint=str(file.resolve()))

@@ -305,9 +305,12 @@ class Parser(argparse.ArgumentParser):
         """Refuse an invalid choice as the rest of morphgen does."""
         if action.choices is not None and value not in action.choices:
             names = map(str, action.choices)
-            raise argparse.ArgumentError(
-                action, f"invalid choice: {value!r}{nearest(str(value), names)}"
-            )
+            # The word after an option that a group lacks is taken for its command.
+            what = "invalid choice"
+            if isinstance(action, _CommandAfterOptions):
+                what = "neither a command nor the value of an option"
+            text = f"{what}: {value!r}{nearest(str(value), names)}"
+            raise argparse.ArgumentError(action, text)
 
 
 class _BriefHelp(argparse._HelpAction):

@@ -77,6 +77,8 @@ def sample(args: argparse.Namespace) -> None:
 
     def summary() -> str:
         lines = [f"{folder}: {report.made} robots written, {report.kept} already existed"]
+        if report.distinct < report.made + report.kept:
+            lines.append(f"  different robots: {report.distinct}")
         rejected = Counter(report.rejected)
         draws = report.made + report.kept + rejected.total()
         for reason, times in rejected.most_common(MAX_LISTED):

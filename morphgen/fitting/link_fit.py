@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from numbers import Real
 
 import numpy as np
 import trimesh
 from scipy.stats import qmc
 
-from morphgen.errors import FitError
+from morphgen.errors import FitError, whole_number
 from morphgen.fitting import search
 from morphgen.fitting.solid import Solid, solid_of
 from morphgen.formats.fits import MAX_PRIMITIVES, are_primitives, shape_to_data
@@ -34,6 +35,7 @@ class FitOptions:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        self._require_numbers()
         if self.spheres is not None:
             if not 1 <= self.spheres <= MAX_PRIMITIVES:
                 raise FitError(f"{self.spheres} spheres: expected 1 to {MAX_PRIMITIVES} per link")
@@ -50,6 +52,14 @@ class FitOptions:
             raise FitError(f"IoU {self.iou}: expected more than 0, at most 1")
         if self.seed < 0:
             raise FitError(f"seed {self.seed}: expected 0 or more")
+
+    def _require_numbers(self) -> None:
+        for name in ("max_primitives", "seed", "spheres"):
+            if name != "spheres" or self.spheres is not None:
+                whole_number(name, getattr(self, name), FitError)
+        for name, value in (("iou", self.iou), ("cover", self.cover or 1)):
+            if not isinstance(value, Real):
+                raise FitError(f"{name} {value!r}: expected a number")
 
 
 @dataclass(frozen=True)

@@ -178,6 +178,7 @@ class SetReport:
 
     made: int  # robots made by this run
     kept: int  # robots that existed before
+    distinct: int  # different robots of the whole set
     rejected: dict[str, int]  # number of rejected draws of the whole set, by reason
 
 
@@ -356,6 +357,7 @@ def _write_index(config: SetConfig, made: int, kept: int) -> SetReport:
     rejected: Counter[str] = Counter()
     lines = [line for _, line in sorted(_finished(config).items())]
     write_atomic(config.folder / INDEX, b"".join(lines))
-    for line in lines:
-        rejected.update(json.loads(line)["rejected"])
-    return SetReport(made, kept, dict(rejected))
+    records = [json.loads(line) for line in lines]
+    for record in records:
+        rejected.update(record["rejected"])
+    return SetReport(made, kept, len({each["hash"] for each in records}), dict(rejected))

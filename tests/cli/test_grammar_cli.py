@@ -48,7 +48,13 @@ def test_sample_creates_a_set_and_prints_its_size(run, tmp_path):
 
 def test_sample_reads_a_grammar_file_and_prints_its_report_as_json(ok, mine):
     report = json.loads(ok("sample", mine, "-n", 2, "--light", "--json", "--where", "mass < 900"))
-    assert report == {"folder": "robots/mine", "made": 2, "kept": 0, "rejected": {}}
+    assert report == {
+        "folder": "robots/mine",
+        "made": 2,
+        "kept": 0,
+        "distinct": 1,
+        "rejected": {},
+    }
     assert [record["name"] for record in records("robots/mine")] == ["mine-000000", "mine-000001"]
 
 

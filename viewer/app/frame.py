@@ -62,6 +62,7 @@ _LINKS = {
     "Compare": Address("compare"),
     "Splits": Address("split"),
     "Playback": Address("play", ("reach",)),
+    "Demonstrations": Address("demos"),
 }
 """The links of the top bar by label."""
 

@@ -164,6 +164,8 @@ def is_submission(data: object) -> bool:
 
 def read_submission(path: Path) -> Submission:
     """Read a submission and check its form, not what it claims."""
+    if path.suffix in (".yaml", ".yml"):
+        raise BenchmarkError(f"{path}: a split, no submission; name it by --split {path}")
     data = read_json(path)
     if not is_submission(data):
         raise BenchmarkError(
