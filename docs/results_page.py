@@ -95,13 +95,12 @@ sys.path.append(str(ROOT / "benchmarks"))
 CURVE = runpy.run_path(str(ROOT / "benchmarks/robot_curve.py"))
 CURVE_OPTIONS = CURVE["arguments"](["--report", "--out", str(ROOT / "results/robot-curve.json")])
 LAW = runpy.run_path(str(ROOT / "benchmarks/scaling_law.py"))
-LAW_SEEDS = (0, 1)
-LAW_NUMBERS = {
-    "push": (1, 10, 30, 100, 300, 1000),
-    "door": (1, 10, 30, 100, 300, 1000),
-    "pose": (1, 3, 10, 30, 100, 1000),
-    "push_cloned": (1, 3, 10, 30),
-    "push_short": (1, 3, 10, 30),
+LAW_CELLS = {  # numbers of robots, and seeds, by task
+    "push": ((1, 10, 30, 100, 300, 1000), range(4)),
+    "door": ((1, 10, 30, 100, 300, 1000), range(2)),
+    "pose": ((1, 3, 10, 30, 100, 1000), range(2)),
+    "push_cloned": ((1, 3, 10, 30, 100, 300), range(3)),
+    "push_short": ((1, 3, 10, 30, 100, 300), range(3)),
 }
 TRANSFER = runpy.run_path(str(ROOT / "benchmarks/similarity_transfer.py"))
 SHIPPED_ARMS = runpy.run_path(str(ROOT / "benchmarks/zero_shot_arms.py"))
@@ -403,7 +402,8 @@ def law_tables() -> str:
     """Return the tables of benchmarks/scaling_law.py."""
     cells = LAW["read_cells"](ROOT / "results/scaling-law.json")
     tables = [
-        LAW["report"](cells, [task], numbers, LAW_SEEDS) for task, numbers in LAW_NUMBERS.items()
+        LAW["report"](cells, [task], numbers, seeds)
+        for task, (numbers, seeds) in LAW_CELLS.items()
     ]
     return "\n\n".join(tables)
 
