@@ -472,7 +472,7 @@ def test_a_table_follows_the_episodes_of_each_controller(run, monkeypatch):
     assert [row.split()[0] for row in rows] == controllers
     assert float(rows[1].split()[-2]) < 0.03 < float(rows[-1].split()[-2])  # ik, random [m]
     assert float(rows[-1].split()[-1]) == 0  # scores are relative to it
-    ended = re.findall(r"(?m)^(\S+): 1 of 1 episodes, \d+ s$", err)
+    ended = re.findall(r"(?m)^(\S+): all 1 episodes, finishing, \d+ s$", err)
     assert list(dict.fromkeys(ended)) == controllers
 
 
