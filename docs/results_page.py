@@ -402,8 +402,7 @@ def law_tables() -> str:
     """Return the tables of benchmarks/scaling_law.py."""
     cells = LAW["read_cells"](ROOT / "results/scaling-law.json")
     tables = [
-        LAW["report"](cells, [task], numbers, seeds)
-        for task, (numbers, seeds) in LAW_CELLS.items()
+        LAW["report"](cells, [task], numbers, seeds) for task, (numbers, seeds) in LAW_CELLS.items()
     ]
     return "\n\n".join(tables)
 
