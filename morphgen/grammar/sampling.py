@@ -357,7 +357,9 @@ def _write_index(config: SetConfig, made: int, kept: int) -> SetReport:
     rejected: Counter[str] = Counter()
     lines = [line for _, line in sorted(_finished(config).items())]
     write_atomic(config.folder / INDEX, b"".join(lines))
-    records = [json.loads(line) for line in lines]
-    for record in records:
+    hashes = set()
+    for line in lines:
+        record = json.loads(line)
         rejected.update(record["rejected"])
-    return SetReport(made, kept, len({each["hash"] for each in records}), dict(rejected))
+        hashes.add(record["hash"])
+    return SetReport(made, kept, len(hashes), dict(rejected))
