@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from morphgen.errors import FormatError, TaskError
+from morphgen.errors import FormatError
 from morphgen.files import replacing_file
 from morphgen.formats.bundle import split_colours
 from morphgen.formats.files import require_writable_file
@@ -144,7 +144,6 @@ def look_at(position: Vec3, target: Vec3) -> Pose:
 
 
 SIZE = (640, 480)  # width and height of a frame [pixels]
-MAX_SIDE = 4096  # largest width and height [pixels]
 SUFFIXES = (".mp4", ".gif")  # suffixes of video files
 
 Camera = Literal["front", "wrist"]
@@ -197,8 +196,6 @@ class Renderer:
 
         The robot at the configurations (n, dof), and further points (m, 3) [m], must be in view.
         """
-        if len(size) != 2 or not all(1 <= side <= MAX_SIDE for side in size):
-            raise TaskError(f"size {size}: expected width and height, each 1 to {MAX_SIDE} pixels")
         self.size, self._robot = size, scene.robot
         self.points = np.concatenate(
             [

@@ -215,6 +215,7 @@ prims_env(obstacles="no") => obstacles 'no': expected True or False
 prims_env(goal_seed=1.5) => goal seed 1.5: expected a whole number, 0
 prims_env(size=64) => size 64: expected width and height
 prims_env(size=(0, 9)) => size 0: expected a whole number, 1 or more
+prims_env(size=(10**9, 9)) => expected at most 4,096 pixels each
 prims_env(observe="ik") => observe 'ik': expected an Observation
 prims_env(num_envs="2") => number of environments '2': expected a
 prims_env(num_envs=1, seed="x") => seed 'x': expected a whole numb
@@ -241,7 +242,7 @@ prims_env(num_envs=0) => 0 environments
 prims_env(num_envs=10**30) => at most 1,048,576 environments
 prims_env(num_envs=2, max_links=10**12) => expected 2 to 10000
 export("prims", "gltf") => unknown format 'gltf'; did you mean 'glb'
-export("prims", "stl") => unknown format 'stl'; valid: 
+export("prims", "stl") => unknown format 'stl'; valid: curobo, gif
 train("prims") => prims: no such file, and no split of this name
 train("prims task=reach", steps="9") => steps '9': expected a whole number, 1
 train("prims task=reach", sim="mujco") => did you mean 'mujoco'
@@ -256,6 +257,8 @@ play("reach", "prims", episodes=0) => episodes 0: expected a whole number, 1
 play("push", "prims", policy="ik") => valid: scripted, zero, random
 goals("arm=ur5 ee=stick") => name one split, or say --task for a robot
 goals("interpolation/arm3/reach", obstacles=True) => obstacles: only with task
+fit("ur5", iou=None) => iou None: expected a number
+fit("ur5", max_primitives=None) => max_primitives None: expected a whole number
 compose(arm=None) => arm None: expected a text or a number
 write("prims", 5) => folder 5: expected a path
 """

@@ -100,10 +100,11 @@ def _bar(
             if (now := time.monotonic()) < due:
                 return
             due = now + interval
-        of = "" if total is None else f" of {total}"
-        count = f": {counted:.0f}{of} {unit}s" if counted or total else ""
         if total and counted >= total:
             count = f": all {total} {unit}s, finishing"
+        else:
+            of = "" if total is None else f" of {total}"
+            count = f": {counted:.0f}{of} {unit}s" if counted or total else ""
         left = (now - begin) * (total / counted - 1) if total and counted else 0
         text = f"{title}{count}, {now - begin:.0f} s" + (f", {left:.0f} s left" if left else "")
         if on_terminal:

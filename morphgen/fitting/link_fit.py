@@ -35,13 +35,17 @@ class FitOptions:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        self._require_numbers()
+        whole_number("max_primitives", self.max_primitives, FitError)
+        whole_number("seed", self.seed, FitError)
+        _require_number("iou", self.iou)
         if self.spheres is not None:
+            whole_number("spheres", self.spheres, FitError)
             if not 1 <= self.spheres <= MAX_PRIMITIVES:
                 raise FitError(f"{self.spheres} spheres: expected 1 to {MAX_PRIMITIVES} per link")
             if self.max_primitives != 1:
                 raise FitError("a fit of spheres takes no max_primitives")
         if self.cover is not None:
+            _require_number("cover", self.cover)
             if self.spheres is None:
                 raise FitError(f"cover {self.cover:g}: expected a number of spheres, too")
             if not 0 < self.cover <= MAX_COVER:
@@ -53,13 +57,10 @@ class FitOptions:
         if self.seed < 0:
             raise FitError(f"seed {self.seed}: expected 0 or more")
 
-    def _require_numbers(self) -> None:
-        for name in ("max_primitives", "seed", "spheres"):
-            if name != "spheres" or self.spheres is not None:
-                whole_number(name, getattr(self, name), FitError)
-        for name, value in (("iou", self.iou), ("cover", self.cover or 1)):
-            if not isinstance(value, Real):
-                raise FitError(f"{name} {value!r}: expected a number")
+
+def _require_number(name: str, value: object) -> None:
+    if not isinstance(value, Real):
+        raise FitError(f"{name} {value!r}: expected a number")
 
 
 @dataclass(frozen=True)

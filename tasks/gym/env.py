@@ -158,9 +158,12 @@ def render_arguments(render_mode: str | None, size: tuple[int, int]) -> tuple[in
         width, height = (whole_number("size", pixels, TaskError, 1) for pixels in size)
     except (TypeError, ValueError) as error:
         raise TaskError(f"size {size!r}: expected width and height [pixels]") from error
+    if max(width, height) > MAX_SIDE:
+        raise TaskError(f"size {size!r}: expected at most {MAX_SIDE:,} pixels each")
     return width, height
 
 
+MAX_SIDE = 4096  # largest width and height of pictures [pixels]
 _OPTIONS = OPTIONS - {"workers", "device", "seed", "first", "configs"} | {"render_mode", "size"}
 
 

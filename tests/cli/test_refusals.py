@@ -159,6 +159,7 @@ STUDY --steps 10 => an update takes
 STUDY --finetune 1000 => --steps 1000 with --envs 64: an update takes 2,048 transitions
 STUDY --episodes 13334 => 13334 episodes
 study small.yaml again.yaml => again.yaml: split 'mine/small' is also in small.yaml; expected sp
+split score some.yaml => some.yaml: a split, no submission; name it by --split
 split score a.json --split some.yaml => a.json: no submission
 play dance prims => see morphgen play --help
 play push => see morphgen play --help

@@ -164,8 +164,7 @@ def is_submission(data: object) -> bool:
 
 def read_submission(path: Path) -> Submission:
     """Read a submission and check its form, not what it claims."""
-    if path.suffix in (".yaml", ".yml"):
-        raise BenchmarkError(f"{path}: a split, no submission; name it by --split {path}")
+    _require_no_split(path)
     data = read_json(path)
     if not is_submission(data):
         raise BenchmarkError(
@@ -175,6 +174,11 @@ def read_submission(path: Path) -> Submission:
     if DIGEST not in data:
         note(f"morphgen: {path}: an earlier version wrote no {DIGEST}: it may have been edited")
     return submission_from(data, path)
+
+
+def _require_no_split(path: Path) -> None:
+    if path.suffix in (".yaml", ".yml"):
+        raise BenchmarkError(f"{path}: a split, no submission; name it by --split")
 
 
 def submission_from(data: object, where: Path | str) -> Submission:
@@ -503,6 +507,7 @@ def read_submissions(paths: Sequence[Path]) -> dict[str, Submission]:
             found |= {f"{table}: {name_of(each)}": each for each in read_table(table)}
         files = sorted(path.rglob("*.json")) if path.is_dir() else [path]
         for file in () if is_table else files:
+            _require_no_split(file)
             data = read_json(file)
             if is_submission(data) or file == path:
                 found[str(file)] = submission = submission_from(data, file)
