@@ -7,7 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import combinations, product
+from itertools import combinations, pairwise, product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -197,22 +197,30 @@ class FreeSpace:
         free = self.free(line, blocks, stop=True)
         return 1.0 if free.all() else max(int(free.argmin()) - 1, 0) / (count - 1)
 
-    def first_reachable(self, start: Array, ends: Array) -> int | None:
-        """Return the first of some configurations (k, J) with a free path from (J,), or None.
+    def best_path(self, start: Array, paths: Array, blocks: Array | None = None) -> int | None:
+        """Return the first free one of some paths (k, W, J) from a configuration (J,).
 
-        Numbers beyond the robot's joints are padding. Ends are tested until ``COMPARED`` different
-        ones are not reached: many starts of inverse kinematics end in one configuration.
+        If none is free, the first that was tested; None if there is none. A path is straight from
+        waypoint to waypoint. Numbers beyond the robot's joints are padding. ``COMPARED`` paths that
+        differ are tested: many starts of inverse kinematics end in one configuration.
+
+        ``blocks`` are two poses of the block, (2, 7): where it is, and where it should not touch
+        the robot at the path's end. Paths whose ends collide, which are most where a block is near,
+        are then left out, and those with ends that touch it at its second pose come last.
         """
-        dof = self.scene.robot.dof
-        tested: list[Array] = []
-        for i, end in enumerate(ends[:, :dof]):
-            if len(tested) == COMPARED:
-                break
-            if all(np.abs(end - other).max() >= SAME for other in tested):
-                if self.free_fraction(start[:dof], end) == 1:
-                    return i
-                tested.append(end)
-        return None
+        paths, start = paths[..., : self.scene.robot.dof], start[: self.scene.robot.dof]
+        difference = np.abs(paths[:, None] - paths).max(axis=(2, 3), initial=0.0)
+        chosen = np.flatnonzero(~np.tril(difference < SAME, -1).any(axis=1))
+        block = None
+        if blocks is not None:
+            block, ends = blocks[0], paths[chosen, -1]
+            is_free, is_clear = (self.free(ends, np.tile(pose, (len(ends), 1))) for pose in blocks)
+            chosen = np.concatenate([chosen[is_free & is_clear], chosen[is_free & ~is_clear]])
+        for i in chosen[:COMPARED].tolist():
+            points = [start, *paths[i]]
+            if all(self.free_fraction(a, b, block) == 1 for a, b in pairwise(points)):
+                return int(i)
+        return int(chosen[0]) if len(chosen) else None
 
     def place_obstacles(self, poses: Sequence[Pose]) -> None:
         """Move the obstacles of the scene to other poses in the world."""

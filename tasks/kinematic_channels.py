@@ -58,7 +58,14 @@ class ToolTargets:
 STARTS = 32  # number of start configurations of a solution
 ITERATIONS = 25  # iterations of damped least squares
 SOLVED = 0.005  # distance of tool and target that counts as a solution [m]
-MOVED = 0.01  # distance that a target moves before it is solved again [m]
+MOVED = 0.05  # distance that a target moves before it is solved again [m]
+AWAY = 0.05
+"""Distance of the path's end from the first target, away from the object, whose corners reach past
+the target [m]."""
+LIFT = 0.2  # height above the path's end from which a second path descends [m]
+RAISED = 0.15
+"""Height at which the object must not touch the robot at the path's end, if there is a choice: a
+link above it would press it to the ground [m]."""
 
 
 class IkSolutions:
@@ -67,8 +74,11 @@ class IkSolutions:
     It is found by damped least squares from the joint targets and from other starts, which are the
     same for all robots as fractions of their joints' ranges. Of several solutions it is the one
     that the robot reaches first on a straight path without a collision; if all paths collide, the
-    nearest. A solution is kept until the episode ends or the target moves. The paths are tested on
-    the CPU: on a GPU, ``update`` copies tensors from it.
+    nearest. A solution is kept until the episode ends or the target moves.
+
+    Where a task has an object, paths end further away from it, are free of it where it is when they
+    are planned, and may lead through a configuration with the tool above the end; those whose ends
+    collide are left out. Paths are tested on the CPU: on a GPU, ``update`` copies tensors from it.
     """
 
     def __init__(
@@ -76,9 +86,16 @@ class IkSolutions:
         tables: RobotTables,
         env_robot_index: torch.Tensor,
         space_of: Callable[[int], FreeSpace],
+        has_object: torch.Tensor | None,
     ) -> None:
-        """Gather the tables of every environment; ``space_of`` returns its scene."""
+        """Gather the tables of every environment.
+
+        ``space_of`` returns the scene of an environment, and ``has_object`` says which scenes have
+        an object, (n,), bool; None if none has.
+        """
         index, self._space_of = env_robot_index, space_of
+        self._has_objects = has_object is not None
+        self._has_object = torch.zeros_like(index).bool() if has_object is None else has_object
         self._tables, self._index = tables, index
         self._lower, self._upper = tables.lower[index], tables.upper[index]
         self._per_step = 1 / tables.max_step[index].clamp(min=1e-6)
@@ -89,65 +106,118 @@ class IkSolutions:
         sobol = torch.quasirandom.SobolEngine(J)  # type: ignore[no-untyped-call]
         sobol.fast_forward(1)  # type: ignore[no-untyped-call]
         self._fractions = sobol.draw(STARTS - 1).to(device)
-        self.q = torch.zeros(n, J, device=device)  # the configurations, shape (n, J) [rad or m]
         self.error = torch.zeros(n, device=device)
-        """Distance from tool to target there, shape (n,) [m]."""
+        """Distance from tool to target at the paths' ends, shape (n,) [m]."""
+        # Configurations on the paths, before their ends, and at their ends, (n, J) [rad or m].
+        self._via, self._end = torch.zeros(2, n, J, device=device)
+        self._is_past = torch.ones(n, dtype=torch.bool, device=device)  # past the first of them
         self._solved_for = torch.full((n, 3), math.inf, device=device)
+
+    @property
+    def waypoint(self) -> torch.Tensor:
+        """Configurations to go to in a straight line, shape (n, J) [rad or m]."""
+        return torch.where(self._is_past[:, None], self._end, self._via)
 
     def forget(self, mask: torch.Tensor) -> None:
         """Forget the solutions of environments whose episode begins."""
         self._solved_for.masked_fill_(mask[:, None], math.inf)
 
-    def update(self, targets: torch.Tensor, goals: ToolTargets, metres_per_radian: float) -> None:
-        """Solve where an episode has begun or the tool's target has moved, from targets (n, J)."""
+    def update(self, targets: torch.Tensor, goals: ToolTargets, object_pose: torch.Tensor) -> None:
+        """Solve where an episode has begun or the tool's target has moved.
+
+        The joint targets have the shape (n, J), the poses of objects (n, 7).
+        """
         points = goals.points[:, 0]
         moved = torch.linalg.vector_norm(points - self._solved_for, dim=1) > MOVED
         exists = goals.exists[:, 0]
-        self.q = torch.where(exists[:, None], self.q, targets)
+        self._end = torch.where(exists[:, None], self._end, targets)
         posed = torch.zeros_like(exists) if goals.has_rotation is None else goals.has_rotation
+        away = points - object_pose[:, :3]
+        away = away / torch.linalg.vector_norm(away, dim=1, keepdim=True).clamp(min=NEAR)
+        away = AWAY * away * self._has_object[:, None]
+        raised = object_pose.clone()
+        raised[:, :3] += away
+        raised[:, 2] += RAISED
         for mask, rotations in ((~posed, None), (posed, goals.rotations)):
             rows = torch.nonzero(moved & exists & mask)[:, 0]
             if len(rows):
                 self._solved_for[rows] = points[rows]
-                self._solve(rows, targets, points, rotations, metres_per_radian)
+                R = None if rotations is None else rotations[rows]
+                paths, error = self._paths(rows, targets, points[rows] + away[rows], R)
+                objects = torch.stack([object_pose[rows], raised[rows]], dim=1)
+                best = self._best(rows, targets[rows], paths, error[0], objects)
+                column = torch.arange(len(rows), device=rows.device)
+                self._via[rows], self._end[rows] = paths[:, best, column]
+                self.error[rows], self._is_past[rows] = error[1, best, column], False
+        left = ((self._via - targets) * self._per_step).abs().amax(dim=1)
+        self._is_past |= left < 1
 
-    def _solve(
+    def _paths(
         self,
         rows: torch.Tensor,
         targets: torch.Tensor,
         points: torch.Tensor,
         rotations: torch.Tensor | None,
-        metres_per_radian: float,
-    ) -> None:
-        """Solve for some environments, shape (k,)."""
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return paths of k environments to points (k, 3), with rotations (k, 3, 3) if any.
+
+        They are two configurations each, (2, S, k, J). With them are the distances of tools from
+        where they should be, (2, S, k) [m]: the larger one of both configurations, and at the end.
+        """
+        chain, index = self._tables.tool_chain, self._index[rows]
         now, lower, upper = targets[rows], self._lower[rows], self._upper[rows]
         random = lower + (upper - lower) * self._fractions[:, None]
         starts = torch.cat([now[None], torch.where(self._moves_tool[rows], random, now)])
-        q, error = solve_ik(
-            self._tables.tool_chain,
-            self._index[rows],
+        end, error = solve_ik(
+            chain,
+            index,
             starts,
-            points[rows],
-            None if rotations is None else rotations[rows],
+            points,
+            rotations,
             (lower, upper),
-            rotation_weight=metres_per_radian,
+            rotation_weight=ROTATION_LENGTH,
             iterations=ITERATIONS,
         )
-        q = self._tables.nearest_turns(self._index[rows], q, now)
-        distance = torch.linalg.vector_norm(error, dim=2)
-        steps = ((q - now) * self._per_step[rows]).abs().amax(dim=2)
-        cost = torch.where(distance < SOLVED, steps, 1e6 * (1 + distance))  # unsolved ones last
+        end = self._tables.nearest_turns(index, end, now)
+        error = torch.linalg.vector_norm(error, dim=2)
+        if not self._has_objects:
+            return torch.stack([end, end]), torch.stack([error, error])
+        up = points + points.new_tensor([0.0, 0.0, LIFT])
+        above, missed = solve_ik(chain, index, end, up, None, (lower, upper), iterations=ITERATIONS)
+        missed = torch.maximum(torch.linalg.vector_norm(missed, dim=2), error)
+        missed = torch.where(self._has_object[rows], missed, math.inf)
+        straight, descending = torch.stack([end, end]), torch.stack([above, end])
+        errors = torch.stack([error, error]), torch.stack([missed, error])
+        return torch.cat([straight, descending], dim=1), torch.cat(errors, dim=1)
+
+    def _best(
+        self,
+        rows: torch.Tensor,
+        now: torch.Tensor,
+        paths: torch.Tensor,
+        error: torch.Tensor,
+        objects: torch.Tensor,
+    ) -> torch.Tensor:
+        """Return the indices (k,) of the best paths (2, S, k, J) from configurations (k, J).
+
+        Objects have two poses, (k, 2, 7): where they are, and raised.
+        """
+        legs = torch.diff(paths, dim=0, prepend=now.expand_as(paths[:1]))
+        steps = (legs * self._per_step[rows]).abs().amax(dim=3).sum(dim=0)
+        cost = torch.where(error < SOLVED, steps, 1e6 * (1 + error))  # unsolved ones last
         order = cost.argsort(dim=0, stable=True).cpu().numpy()
-        here, ends = now.double().cpu().numpy(), q.double().cpu().numpy()
-        solved = (distance < SOLVED).sum(dim=0).tolist()
-        chosen = []  # the first free one; if all paths collide, the nearest
-        for i, env in enumerate(rows.tolist()):
-            preferred = order[: solved[i], i]
-            first = self._space_of(env).first_reachable(here[i], ends[preferred, i])
-            chosen.append(order[first or 0, i])
-        best = torch.tensor(np.array(chosen), device=rows.device)
-        column = torch.arange(len(rows), device=rows.device)
-        self.q[rows], self.error[rows] = q[best, column], distance[best, column]
+        count = (error < SOLVED).sum(dim=0).tolist()
+        here, there = now.double().cpu().numpy(), paths.permute(2, 1, 0, 3).double().cpu().numpy()
+        poses = objects.double().cpu().numpy()
+        best = []
+        for i, (env, has_object) in enumerate(
+            zip(rows.tolist(), self._has_object[rows].tolist(), strict=True)
+        ):
+            solved = order[: count[i], i]
+            blocks = poses[i] if has_object else None
+            first = self._space_of(env).best_path(here[i], there[i, solved], blocks)
+            best.append(order[first or 0, i])  # without any, the nearest
+        return torch.tensor(np.array(best), device=rows.device)
 
 
 BISECTIONS = 8  # halvings of a capsule's axis, to 1/256 of its length
@@ -328,11 +398,11 @@ class KinematicChannels:
         target point, and towards the first one with its orientation, at three gains.
 
     ``ik`` (6)
-        The straight path from the joint's target to a configuration that brings the tool to the
-        first target point, with its orientation if it has one (``IkSolutions``): in largest steps
-        at three gains, in rad or m, and as a share of the joint that needs the most steps; and the
-        logarithm of the tool's distance from the target there. Paths are planned on the CPU: on a
-        GPU this channel alone copies tensors from it.
+        The way from the joint's target to the next configuration of a path that brings the tool to
+        the first target point, with its orientation if it has one (``IkSolutions``): in largest
+        steps at three gains, in rad or m, and as a share of the joint that needs the most steps;
+        and the logarithm of the tool's distance from the target at the end. Paths are planned on
+        the CPU: on a GPU this channel alone copies tensors from it.
 
     ``clearance`` (3)
         How near the links that the joint moves are to the obstacles, as ``Capsules``: 1 in contact
@@ -383,7 +453,9 @@ class KinematicChannels:
         self._per_step = 1 / self._max_step.clamp(min=1e-6)
         self._effort = tables.effort[index].clamp(min=NEAR).log() / 5  # 150 N m become one
         self._is_prismatic = tables.is_prismatic[index].float()
-        self._solutions = IkSolutions(tables, index, space_of) if "ik" in names else None
+        self._solutions: IkSolutions | None = None
+        if "ik" in names:
+            self._solutions = IkSolutions(tables, index, space_of, has_object)
         self._tree = compile_tree(tables.robots, max_links=tables.max_links, device=tables.device)
         self._R_joint_canonical = rotation_from_z(self._tree.joints.axis)[index]
         self._ancestors, tokens = tables.ancestors[index], tables.tokens[index]
@@ -499,8 +571,8 @@ class KinematicChannels:
         assert solutions is not None
         if not state.goals.points.shape[1]:
             raise TaskError("observation channel ik: no task here has target points for the tool")
-        solutions.update(state.targets, state.goals, ROTATION_LENGTH)
-        change = solutions.q - state.targets
+        solutions.update(state.targets, state.goals, state.object_pose)
+        change = solutions.waypoint - state.targets
         steps = change * self._per_step
         # All joints arrive together, and none overshoots in the last step.
         share = steps / steps.abs().amax(dim=1, keepdim=True).clamp(min=1)

@@ -254,7 +254,7 @@ evaluate("zero-shot", goal_seed=1) => goal_seed and library: only with robots
 evaluate("zero-shot", method="mine") => method: only with submission
 evaluate("zero-shot", "prims task=reach", on="tests") => unknown side 'tests'
 play("reach", "prims", episodes=0) => episodes 0: expected a whole number, 1
-play("push", "prims", policy="ik") => valid: scripted, zero, random
+play("push", "prims", policy="ik") => valid: scripted, path, zero, random
 goals("arm=ur5 ee=stick") => name one split, or say --task for a robot
 goals("interpolation/arm3/reach", obstacles=True) => obstacles: only with task
 fit("ur5", iou=None) => iou None: expected a number

@@ -55,6 +55,7 @@ JACOBIAN = Baseline(
     "jacobian", "morphgen.rl.baselines.reach:JacobianColumns", ("reach",), is_independent=True
 )
 IK = Baseline("ik", "morphgen.rl.baselines.reach:InverseKinematics", ("reach",))
+PATH = Baseline("path", "morphgen.rl.baselines.path_push:PathPush", ("push",))
 SCRIPTED = Baseline(
     "scripted",
     "morphgen.rl.baselines.scripted_articulated:Scripted",
@@ -64,7 +65,7 @@ SCRIPTED = Baseline(
 BASELINES: Registry[Baseline] = Registry(
     "baseline",
     "morphgen.baselines",
-    {each.name: each for each in (RANDOM, ZERO, JACOBIAN, IK, SCRIPTED)},
+    {each.name: each for each in (RANDOM, ZERO, JACOBIAN, IK, PATH, SCRIPTED)},
 )
 """Baselines by name; those that solve a task come last."""
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,8 +35,10 @@ from morphgen.rl.ppo import (
 from morphgen.rl.runs.checkpoint import RunConfig
 from morphgen.rl.runs.robot_source import RecordedSource, num_actuated
 from morphgen.tasks.batch import TaskBatch
+from morphgen.tasks.observation import Observation
 
 CHUNK = 4096  # steps whose observations are computed at once
+EPISODES = 256  # episodes that are observed at once, step by step, where earlier steps matter
 MAX_GIB = 24
 """Most memory that the observations of all steps may take [GiB]; they are computed once."""
 
@@ -102,10 +104,26 @@ class DemonstrationBatches:
         )
         self._channels = replace(config.interface.observe, tree_joints=joints)
 
-    def batch(self, number: int, frames: Sequence[int]) -> tuple[TaskBatch, torch.Tensor]:
+    def batch(
+        self, number: int, frames: Sequence[int] | torch.Tensor
+    ) -> tuple[TaskBatch, torch.Tensor]:
         """Return environments in the states of steps of a data set, and the actions there."""
         kind, links = self._config.interface.kind, self._config.max_links
         return self.data[number].batch(frames, self._channels, kind=kind, max_links=links)
+
+    def observed(self, number: int) -> Iterator[tuple[torch.Tensor, Observation, torch.Tensor]]:
+        """Yield steps of a data set, their observations and actions, until it has none left."""
+        data = self.data[number]
+        if not self._channels.ik:
+            for start in range(0, len(data), CHUNK):
+                frames = torch.arange(start, min(start + CHUNK, len(data)))
+                states, action = self.batch(number, frames)
+                yield frames, states.observe(), action
+            return
+        kind, links = self._config.interface.kind, self._config.max_links
+        for start in range(0, len(data.episodes), EPISODES):
+            episodes = range(start, min(start + EPISODES, len(data.episodes)))
+            yield from data.observe_episodes(episodes, self._channels, kind=kind, max_links=links)
 
     def make(self, update: int) -> TaskBatch:
         """Return environments in as many states as a minibatch has."""
@@ -134,17 +152,17 @@ class Cloner(Learner):
         super().__init__(batch, *args, **kwargs)
         parts: list[dict[str, torch.Tensor]] = []
         total = sum(map(len, batches.data))
+        returns: list[torch.Tensor] = []
         for number, data in enumerate(batches.data):
-            for start in range(0, len(data), CHUNK):
-                frames = range(start, min(start + CHUNK, len(data)))
-                states, action = batches.batch(number, frames)
-                seen = {k: v.clone() for k, v in self._needed(states.observe()).items()}
+            of_frame = returns_of(data, self.config.gamma)
+            for frames, observation, action in batches.observed(number):
+                seen = {k: v.clone() for k, v in self._needed(observation).items()}
                 parts.append(seen | {"label": action[:, : self.num_link_rows].clone()})
+                returns.append(of_frame[frames])
                 place = self._place(parts[0], total)
         joined = {name: torch.cat([part.pop(name) for part in parts]) for name in [*parts[0]]}
         self._seen = {name: joined.pop(name).to(place) for name in [*joined]}
         self._labels = self._seen.pop("label")
-        returns = [returns_of(data, self.config.gamma) for data in batches.data]
         self._returns = torch.cat(returns).to(place)
         for start in range(0, total, CHUNK):
             chunk = {name: value[start : start + CHUNK] for name, value in self._seen.items()}

@@ -230,8 +230,45 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
         Raises:
             TaskError: If observations have the channel ``ik``, which depends on earlier steps.
         """
+        if observe is not None and observe.ik:
+            raise TaskError(
+                "observation channel 'ik' depends on earlier steps: use observe_episodes"
+            )
         batch, action = self.batch(frames, observe, kind=kind, max_links=max_links)
         return batch.observe(), action
+
+    def observe_episodes(
+        self,
+        episodes: Sequence[int],
+        observe: ObservationConfig | None = None,
+        *,
+        kind: ActionKind = "continuous",
+        max_links: int | None = None,
+    ) -> Iterator[tuple[torch.Tensor, Observation, torch.Tensor]]:
+        """Yield what ``observe`` returns, step by step of whole episodes, with the frames' indices.
+
+        It is for the channel ``ik``, which depends on earlier steps.
+
+        Args:
+            episodes: Indices of the episodes, which are observed at once.
+            observe: Optional entries of observations.
+            kind: Kind of the actions.
+            max_links: As of ``observe``.
+
+        Yields:
+            Indices of the k steps of the episodes that have not ended, (k,), their observations
+            and their actions (k, L).
+        """
+        chosen = [self.episodes[i] for i in episodes]
+        first = torch.tensor([episode.first for episode in chosen])
+        length = torch.tensor([episode.length for episode in chosen])
+        batch, _ = self.batch(first, observe, kind=kind, max_links=max_links)
+        for step in range(int(length.max())):
+            rows = first + torch.clamp(length - 1, max=step)
+            action = self._put(batch, rows)
+            runs = step < length
+            observation = {name: value[runs] for name, value in batch.observe().items()}
+            yield rows[runs], observation, action[runs]
 
     def batch(
         self,
@@ -245,10 +282,6 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
 
         They cannot be stepped. The arguments are those of ``observe``.
         """
-        if observe is not None and observe.ik:
-            raise TaskError(
-                "observation channel 'ik' depends on earlier steps, which data sets do not keep"
-            )
         rows = torch.as_tensor(frames)
         columns = {name: self.columns[name][rows] for name in _OBSERVED}
         episodes = [self.episodes[i] for i in columns["episode_index"].tolist()]
@@ -268,13 +301,24 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
             observe=observe,
         )
         batch.reset(seed=[episode.seed for episode in episodes])
+        return batch, self._put(batch, rows)
+
+    def _put(self, batch: TaskBatch, rows: torch.Tensor) -> torch.Tensor:
+        """Put environments of the same episodes in the states of other steps; return the actions.
+
+        The steps are one for each environment, (n,), and the actions have the shape (n, L).
+        """
+        columns = {name: self.columns[name][rows] for name in _OBSERVED}
+        simulation = batch.simulation
+        simulation.q.copy_(columns["observation.state"])
+        simulation.qd.copy_(columns["observation.velocity"])
+        simulation.object_pose.copy_(columns["observation.object_pose"])
         batch.targets.copy_(columns["observation.targets"])
         executed = self.columns.get("executed_action", self.columns["normalized_action"])
         before = at_links(batch, executed[(rows - 1).clamp(min=0)])
         starts = (columns["frame_index"] == 0)[:, None]
         batch.previous_action.copy_(before.masked_fill(starts, 0))
-        action = at_links(batch, columns["normalized_action"])
-        return batch, encode_actions(action, kind)
+        return encode_actions(at_links(batch, columns["normalized_action"]), batch.action_kind)
 
     def episode_batch(self, index: int) -> TaskBatch:
         """Return environments in the states of an episode's steps; no other robot is read.

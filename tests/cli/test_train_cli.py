@@ -450,7 +450,7 @@ def test_shipped_policies_are_small_and_act_on_any_robot(name):
         ("--obstacles", ["zero-shot-obstacles", "ik", "jacobian", "random"]),
         ("--goal pose", ["zero-shot-pose", "ik", "jacobian", "random"]),
         ("--goal pose --obstacles", ["zero-shot-pose-obstacles", "ik", "jacobian", "random"]),
-        ("--task push", ["zero-shot-push", "scripted", "random"]),
+        ("--task push", ["zero-shot-push", "scripted", "path", "random"]),
         ("--task door", ["zero-shot-door", "scripted", "random"]),
     ],
 )

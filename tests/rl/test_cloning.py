@@ -79,6 +79,17 @@ def test_dagger_labels_the_states_of_the_policy(demos, tmp_path):
     assert morphgen.clone(demos.folder, resume=True, **small).folder == run.folder
 
 
+def test_a_clone_sees_the_path_of_its_teacher(tmp_path):
+    """The channel ``ik`` depends on earlier steps, so episodes are observed step by step."""
+    recorded = {"policy": "path", "episodes": 5, "only_success": True}
+    data = morphgen.record("arm3-stick", tasks=["push"], out=tmp_path / "demos", **recorded)
+    agent = {"agent": "me-graph+ik+contact+pace", "epochs": 30, "minibatch": 128}
+    run = morphgen.clone(data.folder, out=tmp_path / "run", **agent)
+    result = morphgen.evaluate(run.folder, robots="arm3-stick task=push", episodes=10)
+    (score,) = result.scores["deterministic"]
+    assert score.success > 0.5
+
+
 def test_obstacles_are_those_of_the_goals_of_each_robot(tmp_path):
     """A split says of each of its robots whether it is among obstacles."""
     out = {"tasks": ["reach"], "obstacles": True, "episodes": 1, "out": tmp_path / "demos"}

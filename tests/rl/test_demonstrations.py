@@ -241,9 +241,29 @@ def test_a_position_that_is_not_finite_does_not_agree(described, tmp_path):
     assert not any(each.agrees for each in morphgen.verify(copy).replays)
 
 
-def test_the_channel_ik_is_refused(demos):
+def test_the_channel_ik_is_observed_in_whole_episodes(demos, tmp_path):
+    """The path that it shows is planned when an episode begins, and again as the block moves."""
+    observe = ObservationConfig(ik=True)
     with pytest.raises(TaskError, match="'ik' depends on earlier steps"):
-        demos.observe([0], ObservationConfig(ik=True))
+        demos.observe([0], observe)
+    out = tmp_path / "pushes"
+    pushes = morphgen.record("arm3-stick", tasks=["push"], policy="path", episodes=3, out=out)
+    assert sum(episode.success for episode in pushes.episodes) >= 2
+    seen = {}
+    for frames, observed, labels in pushes.observe_episodes([2, 0], observe):
+        assert len(frames) == len(labels) == len(observed["ik"])
+        seen |= dict(zip(frames.tolist(), observed["ik"], strict=True))
+    (spec,) = pushes.specs.values()
+    for episode in (pushes.episodes[i] for i in (0, 2)):
+        batch = batch_from_specs([spec], 1, sim="mujoco", observe=observe, workers=1)
+        observation = batch.reset(seed=[episode.seed])
+        for frame in episode.frames:
+            torch.testing.assert_close(seen.pop(frame), observation["ik"][0])
+            action = pushes.columns["normalized_action"][frame, None, : spec.robot.dof]
+            action = batch.observation.link_joints(action).where(batch.action_mask, 0.0)
+            observation = batch.step(action).observation
+        batch.close()
+    assert not seen
 
 
 def test_an_interrupted_recording_continues_to_the_same_bytes(folder, tmp_path, monkeypatch):

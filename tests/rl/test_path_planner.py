@@ -244,7 +244,7 @@ def test_a_slide_moves_by_a_share_of_the_error_along_its_axis(made):
 
 def test_different_robots_reach_in_one_batch(made):
     assert baselines_for("reach") == ("ik", "jacobian", "zero", "random")
-    assert baselines_for("push") == ("scripted", "zero", "random")
+    assert baselines_for("push") == ("scripted", "path", "zero", "random")
     batch = made("prims, arm=ur5 ee=stick", 16)
     episodes = run_episodes(batch, JacobianColumns(), 1)
     success = [[e.success for e in episodes if e.robot_index == i] for i in range(2)]

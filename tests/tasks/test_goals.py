@@ -746,15 +746,33 @@ def test_joints_that_do_not_move_the_tool_are_not_split():
 START, BEHIND, BESIDE = np.array([-0.5, 0.0]), np.array([0.5, 0.0]), np.array([-0.5, 0.5])
 
 
-def test_the_first_end_with_a_free_path_is_found():
+def paths(*ends):
+    """Return straight paths to ends (J,)."""
+    return np.array(ends)[:, None]
+
+
+def test_the_first_free_path_is_found():
     wall = Block((0.2, 0.4, 0.4), Pose((0.0, 0.0, 0.2)))
     space, empty = FreeSpace(Scene(ball(0.2), obstacles=(wall,))), FreeSpace(Scene(ball(0.2)))
-    assert space.first_reachable(START, np.array([BEHIND, BESIDE])) == 1
-    assert space.first_reachable(START, np.array([BEHIND, BEHIND + SAME / 2, BESIDE])) == 2
-    assert space.first_reachable(START, BEHIND[None]) is None
-    assert space.first_reachable(START, np.zeros((0, 2))) is None
-    assert empty.first_reachable(START, np.array([BEHIND, BESIDE])) == 0
-    padded = np.array([[*BEHIND, 0.0], [*BESIDE, 0.0]])
-    assert space.first_reachable(np.array([*START, 9.0]), padded) == 1
+    assert space.best_path(START, paths(BEHIND, BESIDE)) == 1
+    assert space.best_path(START, paths(BEHIND, BEHIND + SAME / 2, BESIDE)) == 2
+    through, around = [BEHIND, BESIDE], [BESIDE, np.array([0.5, 0.5])]
+    assert space.best_path(START, np.array([through, around])) == 1
+    assert space.best_path(START, paths(BEHIND)) == 0  # for want of a free one
+    assert space.best_path(START, np.zeros((0, 1, 2))) is None
+    assert empty.best_path(START, paths(BEHIND, BESIDE)) == 0
+    padded = paths([*BEHIND, 0.0], [*BESIDE, 0.0])
+    assert space.best_path(np.array([*START, 9.0]), padded) == 1
     space.place_obstacles([Pose((0.0, 2.0, 0.2))])  # obstacles count where they are
-    assert space.first_reachable(START, BEHIND[None]) == 0
+    assert space.best_path(START, paths(BEHIND, BESIDE)) == 0
+
+
+def test_paths_end_clear_of_the_block_and_of_where_it_must_not_be():
+    block = Block((0.2, 0.2, 0.4), Pose((0.0, 0.0, 0.2)))
+    space = FreeSpace(Scene(ball(0.2), object=block))
+    places = {x: np.array([x, 0.5, 0.2, 1, 0, 0, 0]) for x in (-0.5, 0.5, 5.0)}
+    ends = paths([0.5, 0.5], BESIDE, BEHIND)  # the first two are in the way of the block
+    for blocks, best in (((5.0, 5.0), 0), ((0.5, 5.0), 1), ((0.5, -0.5), 2), ((5.0, 0.5), 1)):
+        assert space.best_path(START, ends, np.array([places[x] for x in blocks])) == best
+    both = np.array([places[0.5], places[0.5]])
+    assert space.best_path(START, ends[:1], both) is None
