@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -185,7 +186,7 @@ def train(
         given.steps = steps or resumed.ppo.total_timesteps
         given.envs = envs or resumed.num_envs
         given.sim = sim or resumed.sim
-    config = _with_networks_of(initial, agent, run_config(source, spec, given))
+    config = _with_networks_of(initial, agent, run_config(source, spec, given), folder)
     require_simulator_device(config.sim, batch_device(config.sim, device))
     _require_used(config, given)
     if isinstance(source, robot_source.GrammarSource):
@@ -194,9 +195,9 @@ def train(
 
 
 def _with_networks_of(
-    initial: str | PathLike[str] | None, agent: str, config: RunConfig
+    initial: str | PathLike[str] | None, agent: str, config: RunConfig, folder: Path
 ) -> RunConfig:
-    """Return the configuration of a run that begins with the networks of a checkpoint."""
+    """Return the configuration of a run in a folder that begins with a checkpoint's networks."""
     if initial is None:
         return config
     if agent != ME_GRAPH.name:
@@ -205,7 +206,9 @@ def _with_networks_of(
         )
     file = one_checkpoint(initial)
     policy = read_checkpoint(file)[0].policy
-    return replace(config, policy=policy, initial_checkpoint=str(file.resolve()))
+    # Relative to the run: checkpoints are published, and a folder names its user.
+    path = os.path.relpath(file.resolve(), folder.resolve())
+    return replace(config, policy=policy, initial_checkpoint=path)
 
 
 def one_checkpoint(policy: str | PathLike[str]) -> Path:
