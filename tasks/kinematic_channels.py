@@ -22,7 +22,7 @@ from morphgen.model.kinematics_torch import (
     FrameChain,
     KinematicTree,
     compile_tree,
-    dls_step,
+    dls_step_within,
     forward_kinematics,
     frame_jacobian,
     frame_pose,
@@ -583,14 +583,9 @@ class KinematicChannels:
     def _dls_step(
         self, J: torch.Tensor, error: torch.Tensor, targets: torch.Tensor
     ) -> torch.Tensor:
-        """Return damped least-squares steps at the gains, shape (n, 3, J), in largest steps.
-
-        Joints whose targets would leave the limits are held in a second pass, so that the others
-        take over their share.
-        """
-        first = targets + dls_step(J, error, DAMPING)
-        free = (first >= self._lower) & (first <= self._upper)
-        step = dls_step(J * free[:, None], error, DAMPING) * self._per_step
+        """Return damped least-squares steps at the gains, shape (n, 3, J), in largest steps."""
+        limits = self._lower, self._upper
+        step = dls_step_within(J, error, DAMPING, targets, limits) * self._per_step
         return torch.stack([torch.tanh(gain * step) for gain in GAINS], dim=1)
 
     def _products(self, J: torch.Tensor, error: torch.Tensor) -> torch.Tensor:

@@ -354,6 +354,23 @@ def dls_step(J: torch.Tensor, error: torch.Tensor, damping: float) -> torch.Tens
     return (J.transpose(-1, -2) @ scaled)[..., 0]
 
 
+def dls_step_within(
+    J: torch.Tensor,
+    error: torch.Tensor,
+    damping: float,
+    q: torch.Tensor,
+    limits: tuple[torch.Tensor, torch.Tensor],
+) -> torch.Tensor:
+    """Return ``dls_step`` from configurations (..., J) with the limits of their joints, each too.
+
+    Joints that would leave their limits are held in a second pass, so that the others take over
+    their share.
+    """
+    there, (lower, upper) = q + dls_step(J, error, damping), limits
+    is_free = (there >= lower) & (there <= upper)
+    return dls_step(J * is_free[..., None, :], error, damping)
+
+
 def pose_task(
     T_root_tool: torch.Tensor,
     J_root_tool: torch.Tensor,

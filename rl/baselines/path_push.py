@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from morphgen.model.kinematics_torch import dls_step, frame_jacobian
+from morphgen.model.kinematics_torch import dls_step_within, frame_jacobian
 from morphgen.rl.baselines.path_planner import fractions_towards
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.batch import TaskBatch
@@ -67,13 +67,9 @@ class PathPush:
         self._task = task
 
     def _fractions(self, task: TaskBatch, J: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
-        """Return actions (n, L) of a step that moves tools by errors (n, 3), within the limits.
-
-        Joints that would leave their limits are held, so that the others take over their share.
-        """
+        """Return actions (n, L) of a step that moves tools by errors (n, 3), within the limits."""
         tables, robots = task.robot_tables, task.env_robot_index
-        there = task.targets + dls_step(J, error, DAMPING)
-        is_free = (there >= tables.lower[robots]) & (there <= tables.upper[robots])
-        steps = dls_step(J * is_free[:, None], error, DAMPING)
+        limits = tables.lower[robots], tables.upper[robots]
+        steps = dls_step_within(J, error, DAMPING, task.targets, limits)
         fractions = steps / tables.max_step[robots].clamp(min=1e-6)
         return self._joints(fractions / fractions.abs().amax(dim=1, keepdim=True).clamp(min=1))
