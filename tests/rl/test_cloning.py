@@ -83,7 +83,7 @@ def test_a_clone_sees_the_path_of_its_teacher(tmp_path):
     """The channel ``ik`` depends on earlier steps, so episodes are observed step by step."""
     recorded = {"policy": "path", "episodes": 5, "only_success": True}
     data = morphgen.record("arm3-stick", tasks=["push"], out=tmp_path / "demos", **recorded)
-    agent = {"agent": "me-graph+ik+contact+pace", "epochs": 30, "minibatch": 128}
+    agent = {"agent": "me-graph+ik+contact+pace", "epochs": 60, "minibatch": 128}
     run = morphgen.clone(data.folder, out=tmp_path / "run", **agent)
     result = morphgen.evaluate(run.folder, robots="arm3-stick task=push", episodes=10)
     (score,) = result.scores["deterministic"]
