@@ -213,9 +213,10 @@ class FreeSpace:
         chosen = np.flatnonzero(~np.tril(difference < SAME, -1).any(axis=1))
         block = None
         if blocks is not None:
-            block, ends = blocks[0], paths[chosen, -1]
-            is_free, is_clear = (self.free(ends, np.tile(pose, (len(ends), 1))) for pose in blocks)
-            chosen = np.concatenate([chosen[is_free & is_clear], chosen[is_free & ~is_clear]])
+            block, second = blocks
+            chosen = chosen[self.free(paths[chosen, -1], np.tile(block, (len(chosen), 1)))]
+            is_clear = self.free(paths[chosen, -1], np.tile(second, (len(chosen), 1)))
+            chosen = np.concatenate([chosen[is_clear], chosen[~is_clear]])
         for i in chosen[:COMPARED].tolist():
             points = [start, *paths[i]]
             if all(self.free_fraction(a, b, block) == 1 for a, b in pairwise(points)):

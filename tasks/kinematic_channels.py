@@ -94,8 +94,8 @@ class IkSolutions:
         an object, (n,), bool; None if none has.
         """
         index, self._space_of = env_robot_index, space_of
-        self._has_objects = has_object is not None
         self._has_object = torch.zeros_like(index).bool() if has_object is None else has_object
+        self._has_objects = bool(self._has_object.any())
         self._tables, self._index = tables, index
         self._lower, self._upper = tables.lower[index], tables.upper[index]
         self._per_step = 1 / tables.max_step[index].clamp(min=1e-6)
@@ -132,19 +132,18 @@ class IkSolutions:
         exists = goals.exists[:, 0]
         self._end = torch.where(exists[:, None], self._end, targets)
         posed = torch.zeros_like(exists) if goals.has_rotation is None else goals.has_rotation
-        away = points - object_pose[:, :3]
-        away = away / torch.linalg.vector_norm(away, dim=1, keepdim=True).clamp(min=NEAR)
-        away = AWAY * away * self._has_object[:, None]
-        raised = object_pose.clone()
-        raised[:, :3] += away
-        raised[:, 2] += RAISED
         for mask, rotations in ((~posed, None), (posed, goals.rotations)):
             rows = torch.nonzero(moved & exists & mask)[:, 0]
             if len(rows):
                 self._solved_for[rows] = points[rows]
                 R = None if rotations is None else rotations[rows]
-                paths, error = self._paths(rows, targets, points[rows] + away[rows], R)
-                objects = torch.stack([object_pose[rows], raised[rows]], dim=1)
+                away = points[rows] - object_pose[rows, :3]
+                away = away / torch.linalg.vector_norm(away, dim=1, keepdim=True).clamp(min=NEAR)
+                away = AWAY * away * self._has_object[rows, None]
+                objects = object_pose[rows, None].repeat(1, 2, 1)
+                objects[:, 1, :3] += away
+                objects[:, 1, 2] += RAISED
+                paths, error = self._paths(rows, targets, points[rows] + away, R)
                 best = self._best(rows, targets[rows], paths, error[0], objects)
                 column = torch.arange(len(rows), device=rows.device)
                 self._via[rows], self._end[rows] = paths[:, best, column]

@@ -271,8 +271,12 @@ def fractions_towards(task: TaskBatch, targets: torch.Tensor) -> torch.Tensor:
 
     They are fractions of the joints' largest steps, such that all joints arrive together.
     """
+    return fractions_of(task, targets - task.targets)
+
+
+def fractions_of(task: TaskBatch, change: torch.Tensor) -> torch.Tensor:
+    """Return the actions (n, L) of ``fractions_towards`` by changes of the joint targets (n, J)."""
     step = task.robot_tables.max_step[task.env_robot_index]
-    change = targets - task.targets
     fractions = torch.where(step > 0, change / step.clamp(min=1e-9), torch.zeros_like(change))
     fractions = fractions / fractions.abs().amax(dim=1, keepdim=True).clamp(min=1)
     joint = task.robot_tables.joint_of_link[task.env_robot_index]

@@ -5,11 +5,10 @@ from __future__ import annotations
 import torch
 
 from morphgen.model.kinematics_torch import dls_step_within, frame_jacobian
-from morphgen.rl.baselines.path_planner import fractions_towards
+from morphgen.rl.baselines.path_planner import fractions_of
 from morphgen.tasks.actions import encode_actions
 from morphgen.tasks.batch import TaskBatch
 from morphgen.tasks.kinematic_channels import AWAY, DAMPING, IkSolutions
-from morphgen.tasks.observation import LinkJoints
 from morphgen.tasks.push.envs import GAP
 from morphgen.tasks.push.task import PushStartSet
 
@@ -49,10 +48,10 @@ class PathPush:
         behind = (y < 0) & (y > -(half + GAP + AWAY + SLACK)) & (ahead < AHEAD * half)
         height = z.clamp(-HEIGHT * half, HEIGHT * half) - z
         error = torch.stack([-x, torch.full_like(y, STEP), height], dim=1)
-        step = self._fractions(task, J[:, :3], error)
-        approach = fractions_towards(task, solutions.waypoint)
-        actions = torch.where((beside & behind)[:, None], step, approach)
-        return encode_actions(actions, task.action_kind)
+        limits = tables.lower[robots], tables.upper[robots]
+        step = dls_step_within(J[:, :3], error, DAMPING, task.targets, limits)
+        change = torch.where((beside & behind)[:, None], step, solutions.waypoint - task.targets)
+        return encode_actions(fractions_of(task, change), task.action_kind)
 
     def _begin(self, task: TaskBatch) -> None:
         """Gather the blocks of a batch's environments."""
@@ -63,13 +62,4 @@ class PathPush:
         self._solutions = IkSolutions(
             task.robot_tables, index, task.layouts.space, task.task_mask("push")
         )
-        self._joints: LinkJoints[torch.Tensor] = LinkJoints(task.robot_tables, index)
         self._task = task
-
-    def _fractions(self, task: TaskBatch, J: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
-        """Return actions (n, L) of a step that moves tools by errors (n, 3), within the limits."""
-        tables, robots = task.robot_tables, task.env_robot_index
-        limits = tables.lower[robots], tables.upper[robots]
-        steps = dls_step_within(J, error, DAMPING, task.targets, limits)
-        fractions = steps / tables.max_step[robots].clamp(min=1e-6)
-        return self._joints(fractions / fractions.abs().amax(dim=1, keepdim=True).clamp(min=1))

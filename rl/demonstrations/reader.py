@@ -265,7 +265,7 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
         batch, _ = self.batch(first, observe, kind=kind, max_links=max_links)
         for step in range(int(length.max())):
             rows = first + torch.clamp(length - 1, max=step)
-            action = self._put(batch, rows)
+            action = self._put(batch, rows, self._observed(rows))
             runs = step < length
             observation = {name: value[runs] for name, value in batch.observe().items()}
             yield rows[runs], observation, action[runs]
@@ -283,7 +283,7 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
         They cannot be stepped. The arguments are those of ``observe``.
         """
         rows = torch.as_tensor(frames)
-        columns = {name: self.columns[name][rows] for name in _OBSERVED}
+        columns = self._observed(rows)
         episodes = [self.episodes[i] for i in columns["episode_index"].tolist()]
         places = {key: i for i, key in enumerate(self.specs)}
         index = [places[episode.robot_index, episode.task] for episode in episodes]
@@ -301,14 +301,19 @@ class Demonstrations(Dataset[dict[str, torch.Tensor]]):
             observe=observe,
         )
         batch.reset(seed=[episode.seed for episode in episodes])
-        return batch, self._put(batch, rows)
+        return batch, self._put(batch, rows, columns)
 
-    def _put(self, batch: TaskBatch, rows: torch.Tensor) -> torch.Tensor:
-        """Put environments of the same episodes in the states of other steps; return the actions.
+    def _observed(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return the features of steps that observations and labels are computed from."""
+        return {name: self.columns[name][rows] for name in _OBSERVED}
 
-        The steps are one for each environment, (n,), and the actions have the shape (n, L).
+    def _put(
+        self, batch: TaskBatch, rows: torch.Tensor, columns: dict[str, torch.Tensor]
+    ) -> torch.Tensor:
+        """Put environments in the states of steps of their episodes; return the actions (n, L).
+
+        The steps are one for each environment, (n,); ``columns`` are what ``_observed`` returns.
         """
-        columns = {name: self.columns[name][rows] for name in _OBSERVED}
         simulation = batch.simulation
         simulation.q.copy_(columns["observation.state"])
         simulation.qd.copy_(columns["observation.velocity"])

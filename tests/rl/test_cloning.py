@@ -104,6 +104,7 @@ def test_training_begins_with_the_networks_of_a_clone(demos, tmp_path):
     clone = morphgen.clone(demos.folder, epochs=0.5, minibatch=64, out=tmp_path / "clone")
     steps = {"steps": 256, "envs": 8, "constants": {"num_steps": 32, "minibatches": 2}}
     run = morphgen.train("prims task=reach", initial=clone.folder, out=tmp_path / "run", **steps)
+    assert run.config.initial_checkpoint == "../clone/checkpoint.pt"
     assert run.config.policy == clone.config.policy
     actors = [read_checkpoint(each.folder)[1]["actor"] for each in (clone, run)]
     assert actors[1]["normalizer.count"] > actors[0]["normalizer.count"] > 0
