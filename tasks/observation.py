@@ -134,9 +134,9 @@ class LinkTokens(Generic[A]):
         self._frequencies: Any = torch.from_numpy(FREQUENCIES[None, None]).float().to(rows.device)
         self._is_movable: Any = is_movable[..., None]
         self._some_wrap, self._all_movable = bool(self._wraps.any()), bool(is_movable.all())
-        first = flat_index(links, tables.max_links)[..., None] * self._constant.shape[2]
+        self._links: Any = flat_index(links, tables.max_links)
         half = torch.arange(len(FREQUENCIES), device=rows.device) + POSITION.start
-        self._sines: Any = first + half
+        self._sines: Any = self._links[..., None] * self._constant.shape[2] + half
         self._cosines: Any = self._sines + len(FREQUENCIES)
 
     def numpy_row(self) -> LinkTokens[NDArray[Any]]:
@@ -161,8 +161,12 @@ class LinkTokens(Generic[A]):
         if not self._all_movable:
             sines, cosines = sines * self._is_movable, cosines * self._is_movable
         tokens: A = duplicate(self._constant)
-        flat = tokens.reshape(-1)
-        flat[self._sines], flat[self._cosines] = sines, cosines
+        if isinstance(tokens, torch.Tensor):  # rows of codes: single numbers take twice as long
+            codes = torch.cat([sines, cosines], dim=-1).flatten(0, 1)
+            tokens.flatten(0, 1)[:, POSITION.columns].index_copy_(0, self._links.flatten(), codes)
+        else:  # single numbers: rows take NumPy three times as long
+            flat = tokens.reshape(-1)
+            flat[self._sines], flat[self._cosines] = sines, cosines
         return tokens
 
 

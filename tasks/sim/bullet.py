@@ -8,6 +8,7 @@ import weakref
 from collections.abc import Collection, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from itertools import filterfalse
 from pathlib import Path
 from typing import Any
 
@@ -120,10 +121,37 @@ def limited_speeds(robot: Robot) -> list[float]:
     ]
 
 
-class MotorForces:
-    """Force limits of a robot's motors, so that arms yield under contact.
+def _motor_rows(robot: Robot, width: int) -> dict[str, Array]:
+    """Return tables of a robot with a row for each movable joint, for ``MotorLaw``.
 
-    A velocity motor pulls with all its effort, as if it were rigid. The law of
+    Every movable joint follows one independent joint, its leader: a row of the map has one number
+    that is not zero. A matrix product might round differently in another batch.
+    """
+    matrix, offset = robot.mimic_map
+    leaders, independent = np.abs(matrix).argmax(axis=1), np.array(robot.independent_rows, int)
+    padding = (0, 0), (0, width - robot.dof)
+    others = np.pad(np.tile(independent, (len(matrix), 1)), padding)
+    pull, swing = (np.pad(GAIN * table.T, padding) for table in _inertia(robot))
+    return {
+        "source": leaders,
+        "leader": independent[leaders],
+        "independent": independent,
+        "others": others,
+        "gain": matrix[np.arange(len(matrix)), leaders],
+        "offset": offset,
+        "pull": pull,
+        "swing": swing,
+        "fastest": np.array(limited_speeds(robot)),
+        "farthest": np.array(farthest_targets(robot, robot.movable_joints)),
+        "effort": np.array([_effort(robot, k) for k in robot.movable_joints]),
+    }
+
+
+class MotorLaw:
+    """Velocities and force limits of the motors of all robots, so that arms yield under contact.
+
+    There is a row for each movable joint of each robot: NumPy takes as long for one robot as for
+    many. A velocity motor pulls with all its effort, as if it were rigid. The law of
     ``morphgen.model.dynamics`` is a spring and a damper; so a motor j may pull as hard as these do
     with the joint-space inertia M at home: the sum over joints k of |M_jk a_k| with the law's
     acceleration a_k = omega^2 e_k - 2 omega v_k, plus ``SLACK``, times ``GAIN``. Free motion needs
@@ -131,30 +159,86 @@ class MotorForces:
     around: up to sqrt(M_jj M_kk) v_k^2.
     """
 
-    def __init__(self, robot: Robot, efforts: Sequence[float]) -> None:
-        """Compute the inertia; efforts are the largest forces of the movable joints [N m or N]."""
-        self._efforts = np.array(efforts, dtype=np.float64)
-        inertia, swing = _inertia(robot)
-        self._pull, self._swing = GAIN * inertia, GAIN * swing
-        self._rows = robot.independent_rows
-        self._farthest = np.array(farthest_targets(robot, robot.movable_joints))
-        self._has_mimic_joints = bool(self._swing.any())
+    def __init__(self, robots: Sequence[Robot], width: int) -> None:
+        """Gather the rows; targets have the shape (n, width)."""
+        tables = {id(robot): _motor_rows(robot, width) for robot in robots}
+        each = [tables[id(robot)] for robot in robots]
 
-    def limits(self, errors: Sequence[Array], velocities: Sequence[Array]) -> Array:
-        """Return the largest forces in a control step, shape (m,) [N m or N].
+        def rows(name: str, stride: int | None = None) -> Any:  # noqa: ANN401 - of any type
+            """Concatenate tables; with a stride, as indices of all robots' rows or targets."""
+            starts = self._starts if stride is None else range(0, stride * len(robots), stride)
+            parts = [table[name] for table in each]
+            if parts[0].dtype.kind == "i":
+                parts = [part + start for part, start in zip(parts, starts, strict=True)]
+            return np.concatenate(parts)
+
+        ends = np.cumsum([len(table["gain"]) for table in each]).tolist()
+        self._starts = [0, *ends[:-1]]
+        self.spans = [slice(*ends) for ends in zip(self._starts, ends, strict=True)]
+        self._source, self._leader = rows("source", width), rows("leader")
+        self._gain, self._offset, self._effort = rows("gain"), rows("offset"), rows("effort")
+        self._fastest, self._farthest = rows("fastest"), rows("farthest")
+        self._independent = rows("independent")
+        self._others, self._pull, self._swing = (
+            np.ascontiguousarray(rows(name).T) for name in ("others", "pull", "swing")
+        )
+        self._has_mimic_joints = bool(self._swing.any())
+        self._positions, self._velocities, self._measured = np.zeros((3, len(self._gain)))
+
+    def reset(self, i: int, positions: Array) -> None:
+        """Put a robot at rest, at positions of all its movable joints."""
+        self._positions[self.spans[i]] = positions
+        self._velocities[self.spans[i]] = self._measured[self.spans[i]] = 0
+
+    def command(self, targets: Array) -> tuple[list[float], list[float]]:
+        """Return velocities and force limits of all motors, at targets (n, width)."""
+        desired = targets.reshape(-1)[self._source] * self._gain + self._offset
+        ends, self._last = self._undisturbed(desired)
+        mean, before = (ends - self._positions) / _PERIOD, self._measured
+        self._commanded = clamp(before + (mean - before) / _MEAN_RESPONSE, self._fastest)
+        errors = desired - self._positions, desired - ends
+        limits = self._limits(errors, (self._velocities, self._last))
+        return self._commanded.tolist(), (limits / _SUBSTEPS).tolist()
+
+    def measure(self, states: Sequence[Sequence[float]]) -> tuple[Array, Array]:
+        """Note states that begin with position and velocity; return the independent joints'."""
+        before = self._measured
+        self._positions = np.array([state[0] for state in states])
+        self._measured = np.array([state[1] for state in states])
+        expected: Array = before + (self._commanded - before) * _FINAL_RESPONSE
+        self._velocities = self._last + (self._measured - expected)
+        return self._positions[self._independent], self._measured[self._independent]
+
+    def _undisturbed(self, desired: Array) -> tuple[Array, Array]:
+        """Return positions and velocities at the end of a control step without disturbances.
+
+        Integrates the critically damped law of ``morphgen.model.dynamics`` in physics steps. Effort
+        limits and contacts are not modelled: they show in the velocity that is measured afterwards,
+        and carry over to the next step.
+        """
+        q, v = self._positions, self._velocities
+        for _ in range(SUBSTEPS):
+            v = clamp(v + _RESPONSE * (_BANDWIDTH * (desired - q) - _TWO * v), self._fastest)
+            q = q + _TIMESTEP * v
+        # Mimic joints follow where their leaders are: a leader at its effort limit is late.
+        return q[self._leader] * self._gain + self._offset, v[self._leader] * self._gain
+
+    def _limits(self, errors: Sequence[Array], velocities: Sequence[Array]) -> Array:
+        """Return the largest forces in a control step [N m or N].
 
         Errors [rad or m] and velocities are those at the beginning, and at the end without
-        contacts, shape (m,) each.
+        contacts.
         """
         springs = [_SPRING * clamp(e, self._farthest) for e in errors]
         dampers = [_DAMPER * v for v in velocities]
         begin, end = (np.abs(k - d) for k, d in zip(springs, dampers, strict=True))
         accelerations = np.maximum(begin, end) + _SLACK * (np.abs(springs[0]) + np.abs(dampers[0]))
-        forces = self._pull * accelerations[self._rows, None]
+        forces = self._pull * accelerations[self._others]
         if self._has_mimic_joints:
             fastest = np.maximum(np.abs(velocities[0]), np.abs(velocities[1]))
-            forces += self._swing * (fastest**2)[self._rows, None]
-        return np.minimum(np.add.reduce(forces, axis=0), self._efforts)
+            forces += self._swing * (fastest**2)[self._others]
+        limits: Array = np.minimum(np.add.reduce(forces, axis=0), self._effort)
+        return limits
 
 
 def _inertia(robot: Robot) -> tuple[Array, Array]:
@@ -186,11 +270,10 @@ class BulletScene:
     the control law only where nothing else moves the joint: the v on the right already includes the
     step's gravity and Coriolis acceleration, of which kd removes only a part. So motors control the
     velocity during a control step, with no more force than a spring and a damper would exert
-    (``MotorForces``). The robot carries its own
-    weight: the world has no gravity, and the block's weight is an external force. One call makes
-    all substeps; the motors act in each, but PyBullet computes their impulse limits with the time
-    of the whole call, hence forces are divided by ``SUBSTEPS``. A mimic joint is a motor that
-    follows its leader.
+    (``MotorLaw``). The robot carries its own weight: the world has no gravity, and the block's
+    weight is an external force. One call makes all substeps; the motors act in each, but PyBullet
+    computes their impulse limits with the time of the whole call, hence forces are divided by
+    ``SUBSTEPS``. A mimic joint is a motor that follows its leader.
 
     Solver. It needs many iterations because motors of one arm pull against each other. Dantzig's
     direct method does not, and is faster, but has no friction cone; so it is used without a block.
@@ -265,7 +348,6 @@ class BulletScene:
         joints = {info[1].decode(): info[0] for info in infos}
         links = {merged.root.name: -1} | {info[12].decode(): info[0] for info in infos}
         self.driven = [joints[merged.joints[k].name] for k in merged.movable_joints]
-        efforts = [_effort(merged, k) for k in merged.movable_joints]
         speeds = limited_speeds(merged)
         fastest = max(speeds, default=math.inf)  # PyBullet has one limit a robot
         if math.isfinite(fastest):
@@ -283,14 +365,6 @@ class BulletScene:
                 pybullet.setCollisionFilterPair(
                     self.robot, self.robot, links[a], links[b], 0, **self._client
                 )
-        self._forces = MotorForces(self._scene.robot, efforts)
-        self._fastest = np.array(speeds)
-        # Every movable joint follows one independent joint, its leader: a row has one number that
-        # is not zero. A matrix product might round differently in another batch.
-        matrix, self._offset = merged.mimic_map
-        leaders = np.abs(matrix).argmax(axis=1)
-        self._gain = matrix[np.arange(len(matrix)), leaders]
-        self._leaders, self._independent = leaders, np.array(merged.independent_rows, np.intp)
         self._motors: dict[str, Any] = {
             "velocityGains": [VELOCITY_GAIN] * len(self.driven),
             **self._client,
@@ -377,8 +451,6 @@ class BulletScene:
         obstacle_poses: Sequence[Sequence[float]] | None = None,
     ) -> None:
         """Put robot, at positions of all movable joints, and block at rest; clear contacts."""
-        self._positions = positions
-        self._velocities, self._measured = np.zeros((2, len(positions)))
         for joint, position in zip(self.driven, positions.tolist(), strict=True):
             pybullet.resetJointState(self.robot, joint, position, **self._client)
         moved = (
@@ -398,44 +470,11 @@ class BulletScene:
         for entry in self._groups:
             pybullet.setCollisionFilterGroupMask(*entry, **self._client)
 
-    def step(self, targets: Array) -> tuple[Array, Array]:
-        """Advance by a control step towards targets of the independent joints, (dof,).
+    def step(self, velocities: list[float], forces: list[float]) -> Sequence[Sequence[float]]:
+        """Make a control step, given velocities and force limits of all movable joints.
 
-        Return their positions and velocities.
+        Return tuples that begin with their positions and velocities.
         """
-        desired = targets[self._leaders] * self._gain + self._offset
-        ends, last = self._undisturbed(desired)
-        mean = (ends - self._positions) / _PERIOD
-        before = self._measured
-        commanded = clamp(before + (mean - before) / _MEAN_RESPONSE, self._fastest)
-        limits = self._forces.limits(
-            (desired - self._positions, desired - ends), (self._velocities, last)
-        )
-        self._simulate(commanded.tolist(), (limits / _SUBSTEPS).tolist())
-        states = pybullet.getJointStates(self.robot, self.driven, **self._client)
-        self._positions = np.array([state[0] for state in states])
-        self._measured = np.array([state[1] for state in states])
-        expected = before + (commanded - before) * _FINAL_RESPONSE
-        self._velocities = last + (self._measured - expected)
-        return self._positions[self._independent], self._measured[self._independent]
-
-    def _undisturbed(self, desired: Array) -> tuple[Array, Array]:
-        """Return positions and velocities at the end of a control step without disturbances.
-
-        Integrates the critically damped law of ``morphgen.model.dynamics`` in physics steps. Effort
-        limits and contacts are not modelled: they show in the velocity that is measured afterwards,
-        and carry over to the next step.
-        """
-        q, v = self._positions, self._velocities
-        for _ in range(SUBSTEPS):
-            v = clamp(v + _RESPONSE * (_BANDWIDTH * (desired - q) - _TWO * v), self._fastest)
-            q = q + _TIMESTEP * v
-        # Mimic joints follow where their leaders are: a leader at its effort limit is late.
-        leaders = self._independent[self._leaders]
-        return q[leaders] * self._gain + self._offset, v[leaders] * self._gain
-
-    def _simulate(self, velocities: list[float], forces: list[float]) -> None:
-        """Make a control step, given velocities and force limits of all movable joints."""
         pybullet.setJointMotorControlArray(
             self.robot,
             self.driven,
@@ -454,6 +493,10 @@ class BulletScene:
                 **self._client,
             )
         pybullet.stepSimulation(**self._client)
+        states: Sequence[Sequence[float]] = pybullet.getJointStates(
+            self.robot, self.driven, **self._client
+        )
+        return states
 
     def object_state(self) -> Array:
         """Return position, quaternion (x, y, z, w), linear and angular velocity of the object.
@@ -520,6 +563,9 @@ class BulletSimulation(HostSimulation):
             folder = resources.enter_context(tempfile.TemporaryDirectory(prefix="morphgen-"))
             resources.callback(_close, self._loaded)
             self._exported = export_scenes(scenes, Path(folder))
+            self._law = MotorLaw([scene.robot for scene in scenes], joints)
+            self._sink = np.flatnonzero(self._is_joint)
+            self._with_object = [i for i, scene in enumerate(scenes) if scene.object is not None]
             self._loaded.extend(map(self._load, range(n)))
             self._go_home()
         except BaseException:
@@ -551,6 +597,7 @@ class BulletSimulation(HostSimulation):
                 self._loaded[i] = self._load(i)
                 self._unreset.remove(i)
             positions = movable_positions(scene.robot, q[row, : scene.robot.dof])
+            self._law.reset(i, positions)
             self._loaded[i].reset(positions, object_pose[row].tolist(), self._obstacle_poses[i])
             self._q[i], self._qd[i] = q[row], 0
             if scene.object is not None:
@@ -562,18 +609,27 @@ class BulletSimulation(HostSimulation):
         if self._unreset:
             where = self._label(min(self._unreset))
             raise SimulationError(f"{where} diverged; expected a reset before the next step")
-        for i, (scene, loaded) in enumerate(zip(self.scenes, self._loaded, strict=True)):
-            dof = scene.robot.dof
-            q, qd = loaded.step(self._targets[i, :dof])
-            self._q[i, :dof], self._qd[i, :dof] = q, qd
-            is_sane = is_within(q, MAX_POSITION) and is_within(qd, MAX_VELOCITY)
-            if scene.object is not None:
-                state = loaded.object_state()
-                self._pose[i], self._velocity[i] = state[FROM_BULLET], state[7:10]
-                is_sane = is_sane and is_within(state, MAX_VELOCITY)
-            if not is_sane:
-                self._unreset.add(i)
+        velocities, forces = self._law.command(self._targets)
+        states: list[Sequence[float]] = []
+        for loaded, span in zip(self._loaded, self._law.spans, strict=True):
+            states += loaded.step(velocities[span], forces[span])
+        q, qd = self._law.measure(states)
+        self._q.reshape(-1)[self._sink], self._qd.reshape(-1)[self._sink] = q, qd
+        is_sane = is_within(q, MAX_POSITION) and is_within(qd, MAX_VELOCITY)
+        if self._with_object:
+            objects = np.array([self._loaded[i].object_state() for i in self._with_object])
+            self._pose[self._with_object] = objects[:, FROM_BULLET]
+            self._velocity[self._with_object] = objects[:, 7:10]
+            is_sane = is_sane and is_within(objects, MAX_VELOCITY)
+        if not is_sane:
+            self._unreset.update(filterfalse(self._is_sane, range(len(self.scenes))))
         return self._unreset
+
+    def _is_sane(self, i: int) -> bool:
+        is_sane = is_within(self._q[i], MAX_POSITION) and is_within(self._qd[i], MAX_VELOCITY)
+        if i in self._with_object:
+            is_sane = is_sane and is_within(self._loaded[i].object_state(), MAX_VELOCITY)
+        return is_sane
 
 
 def _close(loaded: Sequence[BulletScene]) -> None:

@@ -719,7 +719,7 @@ def movable_q(simulation):
     """Return the positions of all movable joints, mimic joints included."""
     if isinstance(simulation, MujocoSimulation):
         return simulation._data[0].qpos[simulation._worlds[0].movable_q_at].copy()
-    return simulation._loaded[0]._positions.copy()
+    return simulation._law._positions.copy()
 
 
 def in_environment(simulation, targets):
