@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -169,8 +169,12 @@ def locked_folder(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def replacing_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder that replaces ``folder`` if the block succeeds."""
+    """Yield a temporary folder that replaces ``folder`` if the block succeeds.
+
+    If it fails, folders above that were made for it are removed.
+    """
     with writing(f"to {folder.parent}"):
+        made = [each for each in folder.parents if not each.exists()]
         folder.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
@@ -187,6 +191,9 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
         raise FormatError(f"{what}: {error.strerror or error}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+        with suppress(OSError):  # one with something in it stays
+            for each in made:
+                each.rmdir()
 
 
 def _swap(folder: Path, partial: Path) -> None:

@@ -389,12 +389,14 @@ def test_other_things_are_not_replaced(tmp_path, kind):
         export(path)
 
 
-def test_failed_export_leaves_the_old_one(tmp_path):
-    folder = export(tmp_path / "arm-urdf")
-    before = tree(tmp_path)
+@pytest.mark.parametrize("name", ["arm-urdf", "new/folder/arm-urdf"])
+def test_failed_export_leaves_what_was_there(tmp_path, name):
+    export(tmp_path / "arm-urdf")
+    before = sorted(tmp_path.rglob("*"))
     with pytest.raises(TypeError):
-        export(folder, 1)
-    assert tree(tmp_path) == before
+        export(tmp_path / name, 1)
+    assert sorted(tmp_path.rglob("*")) == before
+    assert (tmp_path / "arm-urdf/meshes/a.stl").read_text() == "a"
 
 
 def test_triton_is_imported_before_an_opengl_library(monkeypatch):
