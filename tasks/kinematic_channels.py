@@ -137,7 +137,8 @@ class IkSolutions:
             if len(rows):
                 self._solved_for[rows] = points[rows]
                 R = None if rotations is None else rotations[rows]
-                away = points[rows] - object_pose[rows, :3]
+                # From where the tool shall touch the object, the task's second point.
+                away = points[rows] - goals.points[rows, min(1, goals.points.shape[1] - 1)]
                 away = away / torch.linalg.vector_norm(away, dim=1, keepdim=True).clamp(min=NEAR)
                 away = AWAY * away * self._has_object[rows, None]
                 objects = object_pose[rows, None].repeat(1, 2, 1)

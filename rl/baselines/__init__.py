@@ -55,11 +55,10 @@ JACOBIAN = Baseline(
     "jacobian", "morphgen.rl.baselines.reach:JacobianColumns", ("reach",), is_independent=True
 )
 IK = Baseline("ik", "morphgen.rl.baselines.reach:InverseKinematics", ("reach",))
-PATH = Baseline("path", "morphgen.rl.baselines.path_push:PathPush", ("push",))
+_WITH_OBJECTS = ("push", "drawer", "door", "dial")
+PATH = Baseline("path", "morphgen.rl.baselines.path_push:PathPush", _WITH_OBJECTS)
 SCRIPTED = Baseline(
-    "scripted",
-    "morphgen.rl.baselines.scripted_articulated:Scripted",
-    ("push", "drawer", "door", "dial"),
+    "scripted", "morphgen.rl.baselines.scripted_articulated:Scripted", _WITH_OBJECTS
 )
 
 BASELINES: Registry[Baseline] = Registry(

@@ -18,6 +18,7 @@ from morphgen.model.robot import Joint, Link
 from morphgen.rl.baselines import baselines_for, path_planner
 from morphgen.rl.baselines import scripted_push as pushing
 from morphgen.rl.baselines.path_planner import PathCost, PathFollower, PathPlanner
+from morphgen.rl.baselines.path_push import PathPush
 from morphgen.rl.baselines.reach import GAIN, InverseKinematics, JacobianColumns
 from morphgen.rl.baselines.scripted_articulated import Scripted
 from morphgen.rl.baselines.scripted_push import Push, PushPlanner, ScriptedPush, ToolKinematics
@@ -525,6 +526,14 @@ def test_gantries_with_large_and_thin_tools_succeed(task, name, opened):
     spec = member_spec(member, default_library(), GoalConfig())
     task_batch = opened(batch_from_specs([spec], EPISODES, layouts="eval"))
     assert all(episode.success for episode in run_episodes(task_batch, Scripted(0), 1))
+
+
+@pytest.mark.parametrize("task", ["push", *OBJECTS])
+def test_the_path_behind_an_object_leads_on_along_its_motion(task, cache, opened):
+    config = TASKS[task].config_type(num_goals=EPISODES)
+    made = make_batch((task,), [robot("arm3-stick")], EPISODES, configs=[config], cache=cache)
+    episodes = run_episodes(opened(made), PathPush(0), 1)
+    assert [each.success for each in episodes].count(True) >= EPISODES - 1
 
 
 @pytest.mark.slow
