@@ -6,12 +6,12 @@
 
 Each policy is trained on robots that are drawn from the grammar ``serial``, none of which is in a
 split, on GPUs in MuJoCo Warp, or without contacts for poses. All policies of a task have the same
-number of simulated steps. Those of ``push_cloned`` learn, on the CPU, from the successes among 600
-episodes of the policy ``zero-shot-push`` with the drawn robots, and those of ``push_short`` by PPO
-from about as many steps as these episodes have. A seed is that of the robots and of the training.
-The policies are judged in MuJoCo, all in the same episodes, on robots of three kinds, none of which
-they were trained on: other draws of ``serial``; draws of grammars with other structures; and ten
-real arms with a stick.
+number of simulated steps. Those of ``push_cloned`` learn, on the CPU, from the successes among
+about 1,000 episodes of the baseline ``path`` with the drawn robots, with noise on its actions, and
+those of ``push_short`` by PPO from about as many steps as these successes have. A seed is that of
+the robots and of the training. The policies are judged in MuJoCo, all in the same episodes, on
+robots of three kinds, none of which they were trained on: other draws of ``serial``; draws of
+grammars with other structures; and ten real arms with a stick.
 
 Cells, a task with a number of robots and a seed, are kept in ``--out`` as soon as they are judged.
 What is there is not done again, and a training that was stopped is resumed. ``--jobs`` cells are
@@ -96,7 +96,10 @@ _CONTACTS = (
 TASKS = {
     "push": Task("push", 4e6, _CONTACTS),
     "push_cloned": Task(
-        "push", 0, ("--agent", "me-graph+contact+pace", "--no-tensorboard"), episodes=600
+        "push",
+        0,
+        ("--agent", "me-graph+ik+contact+pace", "--epochs", "30", "--no-tensorboard"),
+        episodes=1000,
     ),
     "push_short": Task(
         "push",
@@ -157,8 +160,8 @@ def _commands(cell: Cell, run: Path) -> list[list[str]]:
         steps = ["--robot-seed", seed, "--seed", seed, "--steps", str(task.steps)]
         return [["train", f"task={task.name}", "--robots", robots, *steps, *task.options, *end]]
     demonstrations = str(run.with_name(f"{run.name}-demos"))
-    recorded = ["--tasks", task.name, "--policy", f"zero-shot-{task.name}", "--only-success"]
-    number = ["--episodes", str(task.episodes // cell.robots), "--seed", seed]
+    recorded = ["--tasks", task.name, "--policy", "path", "--noise", "0.2", "--only-success"]
+    number = ["--episodes", str(round(task.episodes / cell.robots)), "--seed", seed]
     return [
         ["record", "--robots", robots, *recorded, *number, "--out", demonstrations],
         ["clone", demonstrations, "--seed", seed, *task.options, *end],

@@ -96,10 +96,10 @@ CURVE = runpy.run_path(str(ROOT / "benchmarks/robot_curve.py"))
 CURVE_OPTIONS = CURVE["arguments"](["--report", "--out", str(ROOT / "results/robot-curve.json")])
 LAW = runpy.run_path(str(ROOT / "benchmarks/scaling_law.py"))
 LAW_CELLS = {  # numbers of robots, and seeds, by task
-    "push": ((1, 10, 30, 100, 300, 1000), range(4)),
-    "door": ((1, 10, 30, 100, 300, 1000), range(2)),
-    "pose": ((1, 3, 10, 30, 100, 1000), range(2)),
-    "push_cloned": ((1, 3, 10, 30), range(3)),
+    "push": ((1, 10, 30, 100, 300, 1000), range(5)),
+    "door": ((1, 10, 30, 100, 300, 1000), range(5)),
+    "pose": ((1, 3, 10, 30, 100, 1000), range(4)),
+    "push_cloned": ((1, 10, 30, 100), range(3)),
     "push_short": ((1, 3, 10, 30), range(2)),
 }
 TRANSFER = runpy.run_path(str(ROOT / "benchmarks/similarity_transfer.py"))
