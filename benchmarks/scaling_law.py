@@ -5,13 +5,13 @@
         [--out results/scaling-law.json] [--report]
 
 Each policy is trained on robots that are drawn from the grammar ``serial``, none of which is in a
-split, on GPUs in MuJoCo Warp, or without contacts for poses. All policies of a task have the same
-number of simulated steps. Those of ``push_cloned`` learn, on the CPU, from the successes among
+split, by PPO on GPUs in MuJoCo Warp, or without contacts for poses; all policies of a task have the
+same number of simulated steps. Those of ``push_cloned`` learn, on the CPU, from the successes among
 about 1,000 episodes of the baseline ``path`` with the drawn robots, with noise on its actions, and
-those of ``push_short`` by PPO from about as many steps as these successes have. A seed is that of
-the robots and of the training. The policies are judged in MuJoCo, all in the same episodes, on
-robots of three kinds, none of which they were trained on: other draws of ``serial``; draws of
-grammars with other structures; and ten real arms with a stick.
+those of ``push_short`` by PPO from 60,000 steps. A seed is that of the robots and of the training.
+The policies are judged in MuJoCo, all in the same episodes, on robots of three kinds, none of which
+they were trained on: other draws of ``serial``; draws of grammars with other structures; and ten
+real arms with a stick.
 
 Cells, a task with a number of robots and a seed, are kept in ``--out`` as soon as they are judged.
 What is there is not done again, and a training that was stopped is resumed. ``--jobs`` cells are
@@ -161,7 +161,7 @@ def _commands(cell: Cell, run: Path) -> list[list[str]]:
         return [["train", f"task={task.name}", "--robots", robots, *steps, *task.options, *end]]
     demonstrations = str(run.with_name(f"{run.name}-demos"))
     recorded = ["--tasks", task.name, "--policy", "path", "--noise", "0.2", "--only-success"]
-    number = ["--episodes", str(round(task.episodes / cell.robots)), "--seed", seed]
+    number = ["--episodes", str(max(1, round(task.episodes / cell.robots))), "--seed", seed]
     return [
         ["record", "--robots", robots, *recorded, *number, "--out", demonstrations],
         ["clone", demonstrations, "--seed", seed, *task.options, *end],

@@ -137,7 +137,7 @@ class IkSolutions:
             if len(rows):
                 self._solved_for[rows] = points[rows]
                 R = None if rotations is None else rotations[rows]
-                # From where the tool shall touch the object, the task's second point.
+                # The second point is on the object's surface, or the centre of a block.
                 away = points[rows] - goals.points[rows, min(1, goals.points.shape[1] - 1)]
                 away = away / torch.linalg.vector_norm(away, dim=1, keepdim=True).clamp(min=NEAR)
                 away = AWAY * away * self._has_object[rows, None]

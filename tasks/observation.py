@@ -118,6 +118,10 @@ def observation_config(names: Collection[str], *, obstacles: int = 0) -> Observa
 class LinkTokens(Generic[A]):
     """Tokens of the links of a batch's environments; only codes of joint positions change."""
 
+    # Places of the codes in flattened tokens, of a row in NumPy only.
+    _sines: Any
+    _cosines: Any
+
     def __init__(self, tables: RobotTables, env_robot_index: torch.Tensor) -> None:
         movable = tables.movable_links[env_robot_index]
         max_movable = int(movable.sum(dim=1).max())
@@ -135,9 +139,6 @@ class LinkTokens(Generic[A]):
         self._is_movable: Any = is_movable[..., None]
         self._some_wrap, self._all_movable = bool(self._wraps.any()), bool(is_movable.all())
         self._links: Any = flat_index(links, tables.max_links)
-        half = torch.arange(len(FREQUENCIES), device=rows.device) + POSITION.start
-        self._sines: Any = self._links[..., None] * self._constant.shape[2] + half
-        self._cosines: Any = self._sines + len(FREQUENCIES)
 
     def numpy_row(self) -> LinkTokens[NDArray[Any]]:
         """Return the tokens of the first environment in NumPy; see ``rows.numpy_row``.
@@ -146,6 +147,9 @@ class LinkTokens(Generic[A]):
         long.
         """
         row: LinkTokens[NDArray[Any]] = numpy_row(self)
+        half = POSITION.start + np.arange(len(FREQUENCIES))
+        row._sines = row._links[..., None] * row._constant.shape[1] + half
+        row._cosines = row._sines + len(FREQUENCIES)
         for name in ("_joint", "_gain", "_offset", "_wraps", "_frequencies", "_is_movable"):
             setattr(row, name, np.broadcast_to(vars(row)[name], row._sines.shape).copy())
         return row

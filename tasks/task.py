@@ -284,6 +284,9 @@ class TaskEnvs(ABC):
     def target_points(self, object_pose: torch.Tensor) -> torch.Tensor:
         """Return points that the tool should visit, shape (k, P, 3) [m]; P is 0 by default.
 
+        Of a task with an object the first is behind it, and the second on or in it: paths of the
+        channel ``ik`` end away from the second.
+
         Args:
             object_pose: Pose of the object, shape (k, 7).
         """

@@ -173,26 +173,37 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
 
     If it fails, folders above that were made for it are removed.
     """
-    with writing(f"to {folder.parent}"):
-        made = [each for each in folder.parents if not each.exists()]
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    with _parents(folder):
+        with writing(f"to {folder.parent}"):
+            partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        try:
+            partial.chmod(0o755)  # mkdtemp makes a folder that only its owner may open
+            yield partial
+            if folder.exists():
+                _swap(folder, partial)
+            else:
+                partial.rename(folder)
+        except OSError as error:
+            name = Path(error.filename or partial)
+            is_read = not name.is_relative_to(partial)
+            what = name if is_read else f"cannot write {folder / name.relative_to(partial)}"
+            raise FormatError(f"{what}: {error.strerror or error}") from error
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+
+
+@contextmanager
+def _parents(folder: Path) -> Iterator[None]:
+    """Make the folders above; those that were not there and end empty are removed."""
+    made: list[Path] = []
     try:
-        partial.chmod(0o755)  # mkdtemp makes a folder that only its owner may open
-        yield partial
-        if folder.exists():
-            _swap(folder, partial)
-        else:
-            partial.rename(folder)
-    except OSError as error:
-        name = Path(error.filename or partial)
-        is_read = not name.is_relative_to(partial)
-        what = name if is_read else f"cannot write {folder / name.relative_to(partial)}"
-        raise FormatError(f"{what}: {error.strerror or error}") from error
+        with writing(f"to {folder.parent}"):
+            made = [each for each in folder.parents if not each.exists()]
+            folder.parent.mkdir(parents=True, exist_ok=True)
+        yield
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
-        with suppress(OSError):  # one with something in it stays
-            for each in made:
+        for each in made:
+            with suppress(OSError):  # one with something in it stays
                 each.rmdir()
 
 

@@ -83,14 +83,12 @@ def _sizes(starts: GoalSet) -> tuple[float, float]:
 
 
 def _axes(motion: torch.Tensor) -> torch.Tensor:
-    """Return unit vectors to the side, along motions (n, 3), and up, shape (n, 3, 3)."""
+    """Return vectors to the side, along motions (n, 3), and up, shape (n, 3, 3)."""
     along = motion / torch.linalg.vector_norm(motion, dim=1, keepdim=True).clamp(min=NEAR)
     up = torch.zeros_like(along)
     up[:, 2] = 1
-    # A motion that is nearly vertical has the side x.
+    # The side of a motion that is nearly vertical is that of x, which is not quite normal to it.
     side = torch.linalg.cross(along, up)
     length = torch.linalg.vector_norm(side, dim=1, keepdim=True)
-    other = torch.zeros_like(side)
-    other[:, 0] = 1
-    side = torch.where(length > 0.1, side / length.clamp(min=NEAR), other)
+    side = torch.where(length > 0.1, side / length.clamp(min=NEAR), up.roll(1, dims=1))
     return torch.stack([side, along, torch.linalg.cross(side, along)], dim=1)

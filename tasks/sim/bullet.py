@@ -150,8 +150,8 @@ def _motor_rows(robot: Robot, width: int) -> dict[str, Array]:
 class MotorLaw:
     """Velocities and force limits of the motors of all robots, so that arms yield under contact.
 
-    There is a row for each movable joint of each robot: NumPy takes as long for one robot as for
-    many. A velocity motor pulls with all its effort, as if it were rigid. The law of
+    There is a row for each movable joint of each robot: NumPy takes hardly longer for many rows.
+    A velocity motor pulls with all its effort, as if it were rigid. The law of
     ``morphgen.model.dynamics`` is a spring and a damper; so a motor j may pull as hard as these do
     with the joint-space inertia M at home: the sum over joints k of |M_jk a_k| with the law's
     acceleration a_k = omega^2 e_k - 2 omega v_k, plus ``SLACK``, times ``GAIN``. Free motion needs
@@ -161,7 +161,8 @@ class MotorLaw:
 
     def __init__(self, robots: Sequence[Robot], width: int) -> None:
         """Gather the rows; targets have the shape (n, width)."""
-        tables = {id(robot): _motor_rows(robot, width) for robot in robots}
+        distinct = {id(robot): robot for robot in robots}
+        tables = {key: _motor_rows(robot, width) for key, robot in distinct.items()}
         each = [tables[id(robot)] for robot in robots]
 
         def rows(name: str, stride: int | None = None) -> Any:  # noqa: ANN401 - of any type
@@ -565,7 +566,8 @@ class BulletSimulation(HostSimulation):
             self._exported = export_scenes(scenes, Path(folder))
             self._law = MotorLaw([scene.robot for scene in scenes], joints)
             self._sink = np.flatnonzero(self._is_joint)
-            self._with_object = [i for i, scene in enumerate(scenes) if scene.object is not None]
+            has_object = [scene.object is not None for scene in scenes]
+            self._with_object = np.flatnonzero(has_object)
             self._loaded.extend(map(self._load, range(n)))
             self._go_home()
         except BaseException:
@@ -616,7 +618,7 @@ class BulletSimulation(HostSimulation):
         q, qd = self._law.measure(states)
         self._q.reshape(-1)[self._sink], self._qd.reshape(-1)[self._sink] = q, qd
         is_sane = is_within(q, MAX_POSITION) and is_within(qd, MAX_VELOCITY)
-        if self._with_object:
+        if len(self._with_object):
             objects = np.array([self._loaded[i].object_state() for i in self._with_object])
             self._pose[self._with_object] = objects[:, FROM_BULLET]
             self._velocity[self._with_object] = objects[:, 7:10]
@@ -627,7 +629,7 @@ class BulletSimulation(HostSimulation):
 
     def _is_sane(self, i: int) -> bool:
         is_sane = is_within(self._q[i], MAX_POSITION) and is_within(self._qd[i], MAX_VELOCITY)
-        if i in self._with_object:
+        if self.scenes[i].object is not None:
             is_sane = is_sane and is_within(self._loaded[i].object_state(), MAX_VELOCITY)
         return is_sane
 

@@ -451,7 +451,7 @@ def test_shipped_policies_are_small_and_act_on_any_robot(name):
         ("--goal pose", ["zero-shot-pose", "ik", "jacobian", "random"]),
         ("--goal pose --obstacles", ["zero-shot-pose-obstacles", "ik", "jacobian", "random"]),
         ("--task push", ["zero-shot-push", "scripted", "path", "random"]),
-        ("--task door", ["zero-shot-door", "scripted", "random"]),
+        ("--task door", ["zero-shot-door", "scripted", "path", "random"]),
     ],
 )
 def test_each_variant_has_a_policy_and_controllers_to_compare(options, controllers, ok):
