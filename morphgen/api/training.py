@@ -206,9 +206,15 @@ def _with_networks_of(
         )
     file = one_checkpoint(initial)
     policy = read_checkpoint(file)[0].policy
-    # Relative to the run: checkpoints are published, and a folder names its user.
-    path = os.path.relpath(file.resolve(), folder.resolve())
-    return replace(config, policy=policy, initial_checkpoint=path)
+    return replace(config, policy=policy, initial_checkpoint=path_from(folder, file))
+
+
+def path_from(folder: Path, file: Path) -> str:
+    """Return the path of a file from a run's folder.
+
+    Checkpoints are published, and an absolute path names its user.
+    """
+    return os.path.relpath(file.resolve(), folder.resolve())
 
 
 def one_checkpoint(policy: str | PathLike[str]) -> Path:

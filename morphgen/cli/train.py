@@ -138,7 +138,7 @@ def _finetuning_config(file: Path, folder: Path, args: argparse.Namespace) -> Ru
     changes |= {name: value for name, value in switches.items() if value is not None}
     changes |= {"total_timesteps": args.steps or steps, "curriculum": args.curriculum}
     return replace(
-        finetuning_config(initial, source, str(file.resolve()), changes),
+        finetuning_config(initial, source, training.path_from(folder, file), changes),
         seed=args.seed,
         sim=args.sim or sim,
         num_envs=args.envs or envs,

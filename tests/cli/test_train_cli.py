@@ -130,7 +130,7 @@ def test_split_is_trained_fine_tuned_and_evaluated_on_both_sides(run, split_yaml
     assert (code, out) == (0, f"a/finetuned/test-seed0/{CHECKPOINT}\n")
     tuned = read_config(Path("a/finetuned/test-seed0"))
     assert (tuned.source.side, tuned.ppo.total_timesteps, tuned.ppo.num_steps) == ("test", 32, 8)
-    assert tuned.initial_checkpoint.endswith(f"a/{CHECKPOINT}")
+    assert tuned.initial_checkpoint == f"../../{CHECKPOINT}"
     assert read_config(Path("a")).ppo.curriculum
     assert (tuned.ppo.curriculum, tuned.ppo.desired_kl) == (False, 0.01)
     first = json.loads(Path("a/finetuned/test-seed0/metrics.jsonl").read_text().splitlines()[0])
@@ -484,7 +484,9 @@ def test_a_shipped_policy_is_named_like_a_checkpoint(ok, run, tmp_path):
     few = ["--steps", "64", "--envs", "2", "--set", "num_steps=8", "--set", "minibatches=2"]
     assert run("finetune", *words, *few, "--no-tensorboard", "--out", tmp_path)[0] == 0
     tuned, _ = read_checkpoint(tmp_path / "checkpoint.pt")
-    assert tuned.initial_checkpoint == str(POLICIES["zero-shot"].file)
+    path = tmp_path / tuned.initial_checkpoint
+    assert not Path(tuned.initial_checkpoint).is_absolute()
+    assert path.resolve() == POLICIES["zero-shot"].file.resolve()
 
 
 def test_other_packages_register_policies(monkeypatch, ok):
