@@ -165,24 +165,24 @@ class MotorLaw:
         tables = {key: _motor_rows(robot, width) for key, robot in distinct.items()}
         each = [tables[id(robot)] for robot in robots]
 
-        def rows(name: str, stride: int | None = None) -> Any:  # noqa: ANN401 - of any type
-            """Concatenate tables; with a stride, as indices of all robots' rows or targets."""
-            starts = self._starts if stride is None else range(0, stride * len(robots), stride)
-            parts = [table[name] for table in each]
-            if parts[0].dtype.kind == "i":
-                parts = [part + start for part, start in zip(parts, starts, strict=True)]
-            return np.concatenate(parts)
-
         ends = np.cumsum([len(table["gain"]) for table in each]).tolist()
-        self._starts = [0, *ends[:-1]]
-        self.spans = [slice(*ends) for ends in zip(self._starts, ends, strict=True)]
-        self._source, self._leader = rows("source", width), rows("leader")
+        starts = [0, *ends[:-1]]
+        self.spans = [slice(*span) for span in zip(starts, ends, strict=True)]
+
+        def rows(name: str) -> Array:
+            return np.concatenate([table[name] for table in each])
+
+        def indices(name: str, firsts: Sequence[int]) -> NDArray[np.intp]:
+            """Turn indices of each robot's rows, or targets, into those of all robots'."""
+            parts = [table[name] + first for table, first in zip(each, firsts, strict=True)]
+            return np.concatenate(parts).astype(np.intp)
+
+        self._source = indices("source", range(0, width * len(robots), width))
+        self._leader, self._independent = indices("leader", starts), indices("independent", starts)
+        self._others = np.ascontiguousarray(indices("others", starts).T)
         self._gain, self._offset, self._effort = rows("gain"), rows("offset"), rows("effort")
         self._fastest, self._farthest = rows("fastest"), rows("farthest")
-        self._independent = rows("independent")
-        self._others, self._pull, self._swing = (
-            np.ascontiguousarray(rows(name).T) for name in ("others", "pull", "swing")
-        )
+        self._pull, self._swing = (np.ascontiguousarray(rows(k).T) for k in ("pull", "swing"))
         self._has_mimic_joints = bool(self._swing.any())
         self._positions, self._velocities, self._measured = np.zeros((3, len(self._gain)))
 
